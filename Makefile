@@ -1,0 +1,61 @@
+# make train   learn Swimmer        make test   every fast check        make help   the rest
+#
+# Each target sets up .venv by itself, once: nothing needs to be installed by hand but Python and make.
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup train test test-slow lock clean
+
+PYTHON ?=
+RUN_DIR ?=
+UV ?= uv
+
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+CANDIDATES := $(if $(PYTHON),$(PYTHON),python3.13 python3.12 python3.11 python3)
+FITS := import sys, ensurepip, venv; sys.exit(sys.version_info < (3, 11))
+
+help:  ## this list
+	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)$$/  make \1|\2/p' $(firstword $(MAKEFILE_LIST)) | while IFS='|' read -r name text; do printf '%-18s %s\n' "$$name" "$$text"; done
+	@echo
+	@echo '  PYTHON=python3.12 chooses the interpreter that .venv is made with, RUN_DIR=runs/mine where `make train` writes.'
+
+train: $(READY)  ## learn Swimmer with the fast preset: a gait within 10 minutes on 2 cores
+	$(BIN)/metrpo train Swimmer $(if $(RUN_DIR),--run-dir $(RUN_DIR))
+
+test: $(READY)  ## lint, types, import rules and the fast tests
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports --no-logo
+	$(BIN)/pytest
+
+test-slow: $(READY)  ## the tests that learn for minutes
+	$(BIN)/pytest -m slow --timeout=1800
+
+setup: $(READY)  ## only set up .venv
+
+lock:  ## take the newest versions into requirements.lock (needs uv; no other target does)
+	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --fork-strategy requires-python \
+	  --extra dev --extra video --annotation-style line --custom-compile-command 'make lock' \
+	  --no-emit-index-url --no-emit-find-links pyproject.toml --output-file requirements.lock
+
+clean:  ## remove .venv and the tools' caches; runs stay
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+
+# Made again when the lock file or pyproject.toml is newer. An interrupted set-up leaves no stamp, so it is taken up again.
+$(READY): pyproject.toml requirements.lock
+	@if $(BIN)/python -c '$(FITS)' >/dev/null 2>&1 && $(BIN)/python -m pip --version >/dev/null 2>&1; then exit 0; fi; \
+	for candidate in $(CANDIDATES); do \
+	  if $$candidate -c '$(FITS)' >/dev/null 2>&1; then \
+	    echo "Setting up $(VENV) with $$candidate ($$($$candidate -V)), once; this takes a few minutes."; \
+	    exec $$candidate -m venv --clear $(VENV); \
+	  fi; \
+	done; \
+	echo 'make: expected Python >= 3.11 with its venv module, found none among: $(CANDIDATES)' >&2; \
+	echo '      Install it (Debian, Ubuntu: apt install python3 python3-venv) or name one: make PYTHON=/path/to/python3.12 ...' >&2; \
+	exit 1
+	$(BIN)/python -m pip install --disable-pip-version-check -r requirements.lock
+	$(BIN)/python -m pip install --disable-pip-version-check --no-deps -e .
+	@touch $@
