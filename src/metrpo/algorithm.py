@@ -1,0 +1,338 @@
+"""The loop: model-ensemble trust-region policy optimization (the paper's Algorithm 2).
+
+    repeat:
+        collect   real episodes with the policy, add them to the dataset        world/collect.py, world/dataset.py
+        fit       every model of the ensemble to the dataset                    model/fit.py
+        repeat:
+            imagine   rollouts through the ensemble with the policy             model/imagine.py
+            improve   the policy on them by TRPO                                policy/advantage.py, policy/trpo.py
+            validate  the policy in each model                                  policy/validate.py
+        until the models no longer agree that it improves
+    until the budget is spent
+
+`step` is one turn of the outer loop and reads like it. All randomness derives from (seed, iteration, stage), so a run
+resumed at an iteration boundary is the same run.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from metrpo.config import Config
+from metrpo.model import ensemble as ensembles
+from metrpo.model.ensemble import Ensemble, Networks
+from metrpo.model.fit import FitInfo, fit
+from metrpo.model.imagine import ImagineInfo, imagine, returns_per_model
+from metrpo.policy import advantage, gaussian, trpo
+from metrpo.policy.gaussian import Policy
+from metrpo.policy.validate import RULES
+from metrpo.run.progress import SILENT, Progress
+from metrpo.types import Array
+from metrpo.world import collect as real
+from metrpo.world import dataset as datasets
+from metrpo.world.dataset import Dataset
+from metrpo.world.task import Task, get_task
+
+Row = dict[str, float | int]
+"""One iteration's metrics, in the order of metrics.csv's columns."""
+
+INIT, COLLECT, FIT, IMPROVE, EVALUATE = range(5)
+"""Stages, for deriving their randomness."""
+
+
+class State(NamedTuple):
+    """Everything that an iteration hands to the next: a pytree whose structure the config fixes."""
+
+    iteration: int
+    """Outer iterations finished."""
+    real_steps: int
+    """Real steps collected so far (evaluation does not count: nothing is learned from it)."""
+    policy: Policy
+    previous_policy: Policy
+    """The policy before the last policy phase that changed it; scales the parameter noise."""
+    networks: Networks
+    """Of the ensemble; its normaliser derives from the dataset."""
+    baseline: Array
+    dataset: Dataset
+
+
+class PhaseInfo(NamedTuple):
+    """What one policy phase did."""
+
+    values: np.ndarray
+    """[K], each model's value of the accepted policy."""
+    updates: int
+    accepted_updates: int
+    """Updates up to the accepted policy."""
+    rejected_steps: int
+    """Updates that the line search rejected."""
+    validations: int
+    fraction_improved: float
+    """Mean over the validations."""
+    kl: float
+    """Mean over the updates."""
+    diverged: float
+    """Share of imagined rollouts, mean over the updates."""
+
+
+def init(config: Config) -> State:
+    """The state before the first iteration."""
+    task = get_task(config.task)
+    policy_key, ensemble_key = jax.random.split(_key(config, 0, INIT))
+    policy = gaussian.init(
+        policy_key, task.state_size, task.action_size, config.policy.hidden, config.policy.initial_std
+    )
+    return State(
+        iteration=0,
+        real_steps=0,
+        policy=policy,
+        previous_policy=policy,
+        networks=_fresh_networks(config, task, ensemble_key),
+        baseline=advantage.init_baseline(task.state_size),
+        dataset=datasets.empty(task.state_size, task.action_size),
+    )
+
+
+def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
+    """One outer iteration: collect, fit, improve until the ensemble disagrees; and evaluate, for the record only."""
+    task = get_task(config.task)
+    iteration = state.iteration + 1
+    clock = Clock()
+    with clock("collect"):
+        progress.stage("collect", config.collect.steps)
+        rng = _rng(config, iteration, COLLECT)
+        actor = partial(_perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise)
+        episodes = real.collect(task, actor, config.collect, rng, progress.update)
+        dataset = datasets.add(state.dataset, episodes, config.collect, rng)
+    with clock("fit"):
+        progress.stage("fit", None)
+        ensemble, fitted = _fit(config, task, state.networks, dataset, iteration, progress)
+    with clock("improve"):
+        progress.stage("improve", config.validate.max_updates)
+        policy, baseline, phase = _improve(config, task, state, dataset, ensemble, iteration, progress, clock)
+    with clock("evaluate"):
+        progress.stage("evaluate", config.evaluation_episodes)
+        seed = int(_rng(config, iteration, EVALUATE).integers(2**31))
+        returns = real.evaluate(task, partial(gaussian.mean, _host(policy)), config.evaluation_episodes, seed)
+    state = State(
+        iteration=iteration,
+        real_steps=state.real_steps + sum(len(e.rewards) for e in episodes),
+        policy=policy,
+        previous_policy=state.policy if phase.accepted_updates else state.previous_policy,
+        networks=ensemble.networks,
+        baseline=baseline,
+        dataset=dataset,
+    )
+    collected = float(np.mean([e.rewards.sum() for e in episodes]))
+    return state, _row(state, returns, collected, fitted, phase, clock)
+
+
+def finished(config: Config, state: State) -> bool:
+    """Whether the budget, iterations or real steps, is spent."""
+    if config.real_steps is not None:
+        return state.real_steps >= config.real_steps
+    return state.iteration >= config.iterations
+
+
+def _fit(
+    config: Config, task: Task, networks: Networks, dataset: Dataset, iteration: int, progress: Progress
+) -> tuple[Ensemble, FitInfo]:
+    init_key, fit_key = jax.random.split(_key(config, iteration, FIT))
+    every = config.fit.reinitialise_every
+    if every and (iteration - 1) % every == 0:
+        networks = _fresh_networks(config, task, init_key)
+    return fit(
+        networks,
+        ensembles.normaliser_of(dataset.train, config.ensemble.std_floor, task.unseen),
+        jax.device_put(datasets.with_capacity(dataset.train, config.collect.max_train)),
+        jax.device_put(datasets.with_capacity(dataset.validation, config.collect.max_validation)),
+        config.fit,
+        fit_key,
+        lambda passes, losses: progress.update(passes, f"validation loss {float(np.mean(losses)):.4g}"),
+    )
+
+
+def _improve(
+    config: Config,
+    task: Task,
+    state: State,
+    dataset: Dataset,
+    ensemble: Ensemble,
+    iteration: int,
+    progress: Progress,
+    clock: Clock,
+) -> tuple[Policy, Array, PhaseInfo]:
+    """The policy phase: updates in blocks, each validated; returns the last accepted policy."""
+    rule, rng = RULES[config.validate.rule], _rng(config, iteration, IMPROVE)
+    key = _key(config, iteration, IMPROVE)
+    pool = dataset.starts
+    if config.imagine.start == "reset":
+        pool = real.reset_states(task, max(config.validate.starts, _rollouts(config, task)), rng)
+    fixed_starts = pool[rng.integers(len(pool), size=config.validate.starts)]
+    policy, baseline = gaussian.reset_std(state.policy, config.policy.initial_std), state.baseline
+    accepted, reference = policy, np.asarray(_validate(task, ensemble, policy, fixed_starts))
+    updates = accepted_at = 0
+    infos: list[tuple[trpo.ImproveInfo, ImagineInfo]] = []
+    fractions: list[float] = []
+    while updates - accepted_at < config.validate.patience and updates < config.validate.max_updates:
+        block = min(config.validate.every, config.validate.max_updates - updates)
+        starts = pool[rng.integers(len(pool), size=(block, _rollouts(config, task)))]
+        policy, baseline, info = _updates(
+            task, config, ensemble, policy, baseline, starts, jax.random.fold_in(key, updates)
+        )
+        infos.append(jax.device_get(info))
+        updates += block
+        with clock("validate"):
+            values = np.asarray(_validate(task, ensemble, policy, fixed_starts))
+        verdict = rule(values, reference, config.validate)
+        fractions.append(verdict.fraction_improved)
+        if verdict.accepted:
+            accepted, reference, accepted_at = policy, values, updates
+        progress.update(updates, f"accepted {accepted_at}, imagined return {np.nanmean(reference):.2f}")
+    improve_info, imagine_info = jax.tree.map(lambda *xs: np.concatenate(xs), *infos)
+    return (
+        accepted,
+        baseline,
+        PhaseInfo(
+            values=reference,
+            updates=updates,
+            accepted_updates=accepted_at,
+            rejected_steps=int(np.sum(~improve_info.accepted)),
+            validations=len(fractions),
+            fraction_improved=float(np.mean(fractions)),
+            kl=float(np.mean(improve_info.kl)),
+            diverged=float(np.mean(imagine_info.diverged)),
+        ),
+    )
+
+
+@partial(jax.jit, static_argnames=("task", "config"))
+def _compiled_updates(
+    task: Task, config: Config, ensemble: Ensemble, policy: Policy, baseline: Array, starts: Array, keys: Array
+) -> tuple[Policy, Array, tuple[trpo.ImproveInfo, ImagineInfo]]:
+    """Policy updates in one compiled call, one for each batch of start states [updates, N, S]."""
+
+    def update(
+        carry: tuple[Policy, Array], given: tuple[Array, Array]
+    ) -> tuple[tuple[Policy, Array], tuple[trpo.ImproveInfo, ImagineInfo]]:
+        (policy, baseline), (starts, key) = carry, given
+        rollouts, imagined = imagine(
+            ensemble,
+            partial(gaussian.sample, policy),
+            task.reward,
+            task.terminated,
+            starts,
+            task.horizon,
+            key,
+            config.imagine.sampling,
+        )
+        a = config.advantage
+        advantages, baseline = advantage.advantages_and_baseline(rollouts, baseline, a.discount, a.gae_lambda, a.ridge)
+        batch = trpo.Batch(
+            *(x.reshape(-1, *x.shape[2:]) for x in (rollouts.states, rollouts.actions, advantages, rollouts.mask))
+        )
+        policy, improved = trpo.improve(policy, batch, config.trpo)
+        return (policy, baseline), (improved, imagined)
+
+    (policy, baseline), infos = jax.lax.scan(update, (policy, baseline), (starts, keys))
+    return policy, baseline, infos
+
+
+def _updates(
+    task: Task, config: Config, ensemble: Ensemble, policy: Policy, baseline: Array, starts: np.ndarray, key: Array
+) -> tuple[Policy, Array, tuple[trpo.ImproveInfo, ImagineInfo]]:
+    # What cannot change the compiled code (seed, budget, ...) must not cause a compilation: it is set to a constant.
+    relevant = Config(task=task.name, imagine=config.imagine, advantage=config.advantage, trpo=config.trpo)
+    return _compiled_updates(task, relevant, ensemble, policy, baseline, starts, jax.random.split(key, len(starts)))
+
+
+@partial(jax.jit, static_argnames="task")
+def _validate(task: Task, ensemble: Ensemble, policy: Policy, starts: Array) -> Array:
+    return returns_per_model(
+        ensemble, partial(gaussian.mean, policy), task.reward, task.terminated, starts, task.horizon
+    )
+
+
+def _perturbed(policy: Policy, previous: Policy, scale: float, rng: np.random.Generator) -> real.Act:
+    """The mean action of the policy with its parameters perturbed (paper, appendix A.1.1)."""
+
+    def noisy(now: np.ndarray, before: np.ndarray) -> np.ndarray:
+        return now + scale * np.abs(now - before) * rng.standard_normal(now.shape)
+
+    perturbed = policy._replace(layers=jax.tree.map(noisy, policy.layers, previous.layers))
+    return partial(gaussian.mean, perturbed)
+
+
+def _row(state: State, returns: np.ndarray, collected: float, fitted: FitInfo, phase: PhaseInfo, clock: Clock) -> Row:
+    imagined = float(np.mean(phase.values))
+    losses = np.asarray(fitted.validation_loss)
+    return {
+        "iteration": state.iteration,
+        "real_steps": state.real_steps,
+        "return_real": float(np.mean(returns)),
+        "return_real_std": float(np.std(returns)),
+        "return_collected": collected,
+        "return_imagined": imagined,
+        "gap": imagined - float(np.mean(returns)),
+        **{f"validation_loss_{k}": float(loss) for k, loss in enumerate(losses)},
+        "train_loss": float(np.mean(fitted.train_loss)),
+        "fit_passes": fitted.passes,
+        "updates": phase.updates,
+        "accepted_updates": phase.accepted_updates,
+        "rejected_steps": phase.rejected_steps,
+        "validations": phase.validations,
+        "fraction_improved": phase.fraction_improved,
+        "kl": phase.kl,
+        "mean_std": float(np.mean(np.exp(np.asarray(state.policy.log_std)))),
+        "diverged": phase.diverged,
+        **clock.row(),
+    }
+
+
+class Clock:
+    """Seconds per stage; a stage inside another (validate in improve) is not counted twice."""
+
+    def __init__(self) -> None:
+        self.seconds = dict.fromkeys(("collect", "fit", "improve", "validate", "evaluate"), 0.0)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        start, counted = time.perf_counter(), sum(self.seconds.values())
+        yield
+        inner = sum(self.seconds.values()) - counted
+        self.seconds[stage] += time.perf_counter() - start - inner
+
+    def row(self) -> Row:
+        """Metrics columns."""
+        return {f"seconds_{stage}": seconds for stage, seconds in self.seconds.items()}
+
+
+def _rollouts(config: Config, task: Task) -> int:
+    """Imagined episodes per update: enough for `imagine.steps` steps."""
+    return -(-config.imagine.steps // task.horizon)
+
+
+def _fresh_networks(config: Config, task: Task, key: Array) -> Networks:
+    e = config.ensemble
+    return ensembles.init(key, e.members, task.state_size, task.action_size, e.hidden)
+
+
+def _host(policy: Policy) -> Policy:
+    return jax.tree.map(np.asarray, policy)
+
+
+def _key(config: Config, iteration: int, stage: int) -> Array:
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), iteration), stage)
+
+
+def _rng(config: Config, iteration: int, stage: int) -> np.random.Generator:
+    return np.random.default_rng([config.seed, iteration, stage])

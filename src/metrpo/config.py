@@ -1,0 +1,313 @@
+"""Every setting of a run: frozen dataclasses of numbers, strings and tuples, JSON both ways.
+
+The defaults are the paper's values (its appendix A.1) or, where it is silent, its authors' settings;
+`metrpo.presets` holds what differs from task to task and the `fast` preset.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import types
+import typing
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from metrpo.errors import ConfigError
+
+
+def _require(condition: bool, name: str, value: object, expected: str) -> None:
+    if not condition:
+        raise ConfigError(f"{name}: expected {expected}, got {value!r}")
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """Collecting real transitions (paper, appendix A.1.1)."""
+
+    steps: int = 3000
+    """Real steps per outer iteration, at least: whole episodes are played until this many are reached."""
+    max_std: float = 3.0
+    """Exploration noise: the standard deviation is drawn from U[0, max_std]."""
+    std_per: Literal["episode", "step"] = "episode"
+    """How often that standard deviation is drawn: once an episode (the paper) or at every step (its authors' code)."""
+    parameter_noise: float = 3.0
+    """Scale of the parameter noise: std = scale * |policy - previous policy|, redrawn every episode; 0 switches it off."""
+    validation_fraction: float = 1 / 3
+    """Share of the new episodes that goes to the validation set."""
+    max_train: int = 200_000
+    """Most transitions kept for training; the oldest go first."""
+    max_validation: int = 100_000
+    """Most transitions kept for validation; the oldest go first."""
+
+    def __post_init__(self) -> None:
+        _require(self.steps >= 1, "collect.steps", self.steps, "at least 1")
+        _require(_nonnegative(self.max_std), "collect.max_std", self.max_std, "a finite number >= 0")
+        _require(
+            _nonnegative(self.parameter_noise), "collect.parameter_noise", self.parameter_noise, "a finite number >= 0"
+        )
+        _require(
+            0 < self.validation_fraction < 1,
+            "collect.validation_fraction",
+            self.validation_fraction,
+            "between 0 and 1, both excluded",
+        )
+        _require(self.max_train >= 1, "collect.max_train", self.max_train, "at least 1")
+        _require(self.max_validation >= 1, "collect.max_validation", self.max_validation, "at least 1")
+
+
+@dataclass(frozen=True)
+class EnsembleConfig:
+    """The ensemble of dynamics models (paper, section 5 and appendix A.1.2)."""
+
+    members: int = 5
+    """K, the number of models."""
+    hidden: tuple[int, ...] = (1024, 1024)
+    """Sizes of the hidden layers (ReLU)."""
+    std_floor: float = 0.1
+    """Smallest standard deviation that the normaliser divides by."""
+
+    def __post_init__(self) -> None:
+        _require(self.members >= 1, "ensemble.members", self.members, "at least 1")
+        _require(all(n >= 1 for n in self.hidden), "ensemble.hidden", self.hidden, "sizes of at least 1")
+        _require(_positive(self.std_floor), "ensemble.std_floor", self.std_floor, "a finite number > 0")
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Fitting the ensemble (paper, appendix A.1.2)."""
+
+    learning_rate: float = 1e-3
+    """Adam's step size."""
+    batch_size: int = 1000
+    """Transitions per minibatch, drawn with replacement and for each model independently."""
+    validate_every: int = 5
+    """Passes over the training set between two validations."""
+    patience: int = 25
+    """Stop when no model has improved its validation loss for this many passes."""
+    max_passes: int = 2000
+    """Most passes over the training set in one outer iteration."""
+    reinitialise_every: int = 5
+    """Fresh weights in every n-th outer iteration (1, 1+n, ...), warm start in the others; 0: only in the first."""
+
+    def __post_init__(self) -> None:
+        _require(_positive(self.learning_rate), "fit.learning_rate", self.learning_rate, "a finite number > 0")
+        for name in ("batch_size", "validate_every", "patience", "max_passes"):
+            _require(getattr(self, name) >= 1, f"fit.{name}", getattr(self, name), "at least 1")
+        _require(self.reinitialise_every >= 0, "fit.reinitialise_every", self.reinitialise_every, "at least 0")
+
+
+@dataclass(frozen=True)
+class ImagineConfig:
+    """Imagined rollouts (paper, section 5, "Policy optimization")."""
+
+    steps: int = 50_000
+    """Imagined steps per policy update (TRPO's batch)."""
+    sampling: Literal["step_rand"] = "step_rand"
+    """How the next state comes out of the ensemble; step_rand: one model drawn per state and step."""
+    start: Literal["dataset", "reset"] = "dataset"
+    """Start states of imagined episodes: those of real episodes in the dataset, or fresh real resets (uncounted)."""
+
+    def __post_init__(self) -> None:
+        _require(self.steps >= 1, "imagine.steps", self.steps, "at least 1")
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """The Gaussian policy (paper, appendix A.1.3)."""
+
+    hidden: tuple[int, ...] = (32, 32)
+    """Sizes of the hidden layers (tanh)."""
+    initial_std: float = 1.0
+    """Standard deviation at the start of every policy phase."""
+
+    def __post_init__(self) -> None:
+        _require(all(n >= 1 for n in self.hidden), "policy.hidden", self.hidden, "sizes of at least 1")
+        _require(_positive(self.initial_std), "policy.initial_std", self.initial_std, "a finite number > 0")
+
+
+@dataclass(frozen=True)
+class AdvantageConfig:
+    """Advantages and their baseline (authors' settings: no discount, lambda 1, linear features)."""
+
+    discount: float = 1.0
+    """gamma."""
+    gae_lambda: float = 1.0
+    """lambda of generalised advantage estimation."""
+    ridge: float = 1e-5
+    """Ridge penalty of the linear-feature baseline."""
+
+    def __post_init__(self) -> None:
+        _require(0 <= self.discount <= 1, "advantage.discount", self.discount, "between 0 and 1")
+        _require(0 <= self.gae_lambda <= 1, "advantage.gae_lambda", self.gae_lambda, "between 0 and 1")
+        _require(_positive(self.ridge), "advantage.ridge", self.ridge, "a finite number > 0")
+
+
+@dataclass(frozen=True)
+class TRPOConfig:
+    """The trust-region step (Schulman et al. 2015; step size from the paper, appendix A.1.3)."""
+
+    max_kl: float = 0.01
+    """Trust region: the largest mean KL divergence from the old to the new policy."""
+    cg_iterations: int = 10
+    """Conjugate-gradient iterations."""
+    damping: float = 1e-5
+    """Added to the Fisher matrix's diagonal."""
+    backtrack_ratio: float = 0.8
+    """The line search tries backtrack_ratio^i of the full step, i = 0, 1, ..."""
+    max_backtracks: int = 15
+    """Tries of the line search; when all fail the update is rejected."""
+
+    def __post_init__(self) -> None:
+        _require(_positive(self.max_kl), "trpo.max_kl", self.max_kl, "a finite number > 0")
+        _require(self.cg_iterations >= 1, "trpo.cg_iterations", self.cg_iterations, "at least 1")
+        _require(_nonnegative(self.damping), "trpo.damping", self.damping, "a finite number >= 0")
+        _require(
+            0 < self.backtrack_ratio < 1, "trpo.backtrack_ratio", self.backtrack_ratio, "between 0 and 1, both excluded"
+        )
+        _require(self.max_backtracks >= 1, "trpo.max_backtracks", self.max_backtracks, "at least 1")
+
+
+@dataclass(frozen=True)
+class ValidateConfig:
+    """When to stop improving the policy (paper, section 5, "Policy validation")."""
+
+    rule: Literal["ensemble"] = "ensemble"
+    """Who decides; ensemble: each model votes whether the policy improved on the last accepted one."""
+    every: int = 5
+    """Policy updates between two validations."""
+    threshold: float = 0.7
+    """Accept while at least this share of the models improves."""
+    patience: int = 25
+    """Stop when this many updates have passed since the last accepted policy."""
+    max_updates: int = 400
+    """Most policy updates in one outer iteration."""
+    starts: int = 500
+    """Fixed start states from which every model evaluates the policy, deterministic, over the full horizon."""
+
+    def __post_init__(self) -> None:
+        for name in ("every", "patience", "max_updates", "starts"):
+            _require(getattr(self, name) >= 1, f"validate.{name}", getattr(self, name), "at least 1")
+        _require(0 <= self.threshold <= 1, "validate.threshold", self.threshold, "between 0 and 1")
+
+
+@dataclass(frozen=True)
+class Config:
+    """One run, whole: what `config.json` in a run directory holds."""
+
+    task: str
+    """Name of a registered task (see `metrpo tasks`)."""
+    preset: Literal["fast", "paper"] = "fast"
+    """The preset that the values came from; a label, the values themselves count."""
+    seed: int = 0
+    """All randomness derives from it."""
+    iterations: int = 10
+    """Outer iterations; may be raised later to go on with a finished run."""
+    real_steps: int | None = None
+    """Instead of `iterations`: go on until this many real steps have been collected."""
+    improver: Literal["trpo"] = "trpo"
+    """How the policy is improved."""
+    evaluation_episodes: int = 20
+    """Real episodes of the deterministic policy that `return_real` averages; a report, never used to learn."""
+    deterministic: bool = False
+    """One thread, same bytes every time; clock readings are left out of metrics.csv. Slower."""
+    collect: CollectConfig = field(default_factory=CollectConfig)
+    ensemble: EnsembleConfig = field(default_factory=EnsembleConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    imagine: ImagineConfig = field(default_factory=ImagineConfig)
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    advantage: AdvantageConfig = field(default_factory=AdvantageConfig)
+    trpo: TRPOConfig = field(default_factory=TRPOConfig)
+    validate: ValidateConfig = field(default_factory=ValidateConfig)
+
+    def __post_init__(self) -> None:
+        _require(bool(self.task), "task", self.task, "a task name")
+        _require(0 <= self.seed < 2**31, "seed", self.seed, "between 0 and 2^31 - 1")
+        _require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
+        _require(self.real_steps is None or self.real_steps >= 1, "real_steps", self.real_steps, "at least 1")
+        _require(self.evaluation_episodes >= 1, "evaluation_episodes", self.evaluation_episodes, "at least 1")
+
+
+BUDGET_FIELDS = ("iterations", "real_steps")
+"""Fields that say how long to run, not what is run: they may change when a run is resumed."""
+
+
+def to_json(config: Config) -> str:
+    """The config as JSON text, one setting a line."""
+    return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
+
+
+def from_json(text: str) -> Config:
+    """The config that `to_json` wrote.
+
+    Raises `ConfigError` when the text is no JSON, a setting is missing, unknown, of the wrong type or impossible.
+    """
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"config: expected JSON, got something else ({error})") from None
+    return _build(Config, data, "config")
+
+
+def flatten(config: Config) -> dict[str, Any]:
+    """Every setting by its dotted name, as on the command line: `{"fit.learning_rate": 0.001, ...}`."""
+
+    def walk(value: Any, prefix: str) -> typing.Iterator[tuple[str, Any]]:
+        for f in dataclasses.fields(value):
+            inner = getattr(value, f.name)
+            name = f"{prefix}{f.name}"
+            if dataclasses.is_dataclass(inner):
+                yield from walk(inner, f"{name}.")
+            else:
+                yield name, inner
+
+    return dict(walk(config, ""))
+
+
+def difference(old: Config, new: Config) -> dict[str, tuple[Any, Any]]:
+    """Settings that differ, budget aside: `{"fit.learning_rate": (old, new)}`."""
+    ours, theirs = flatten(old), flatten(new)
+    return {
+        name: (ours[name], theirs[name]) for name in ours if name not in BUDGET_FIELDS and ours[name] != theirs[name]
+    }
+
+
+def _positive(value: float) -> bool:
+    return math.isfinite(value) and value > 0
+
+
+def _nonnegative(value: float) -> bool:
+    return math.isfinite(value) and value >= 0
+
+
+def _build(cls: type, data: object, where: str) -> Any:
+    if not isinstance(data, dict):
+        raise ConfigError(f"{where}: expected an object with its settings, got {data!r}")
+    hints = typing.get_type_hints(cls)
+    names = [f.name for f in dataclasses.fields(cls)]
+    wrong = [f"missing {n}" for n in names if n not in data] + [f"unknown {n}" for n in data if n not in names]
+    if wrong:
+        raise ConfigError(f"{where}: expected exactly the settings of this version, got {', '.join(wrong)}")
+    return cls(**{name: _convert(hints[name], data[name], f"{where}.{name}") for name in names})
+
+
+def _convert(kind: Any, value: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(kind):
+        return _build(typing.cast(type, kind), value, where)
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is types.UnionType:
+        return None if value is None else _convert(arguments[0], value, where)
+    if origin is Literal:
+        if value not in arguments:
+            raise ConfigError(f"{where}: expected one of {', '.join(map(str, arguments))}, got {value!r}")
+        return value
+    if origin is tuple:
+        if not isinstance(value, list):
+            raise ConfigError(f"{where}: expected a list, got {value!r}")
+        return tuple(_convert(arguments[0], item, where) for item in value)
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is not kind:
+        raise ConfigError(f"{where}: expected {kind.__name__}, got {value!r}")
+    return value

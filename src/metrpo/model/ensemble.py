@@ -1,0 +1,82 @@
+"""K dynamics networks as one pytree: state and action in, next state out (paper, sections 4.1 and 5).
+
+The networks are stacked along a leading axis K and evaluated by one batched product per layer. A library's module
+would have to be vmapped to the same products, so the forty lines are written out.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from metrpo.types import Array, Normaliser, Transitions
+
+Networks = tuple[tuple[Array, Array], ...]
+"""One (weights [K, in, out], biases [K, 1, out]) a layer."""
+
+
+class Ensemble(NamedTuple):
+    """K networks and the normaliser that they share."""
+
+    networks: Networks
+    normaliser: Normaliser
+
+    @property
+    def members(self) -> int:
+        """K."""
+        return int(self.networks[0][0].shape[0])
+
+
+def init(key: Array, members: int, state_size: int, action_size: int, hidden: tuple[int, ...]) -> Networks:
+    """Fresh networks: Xavier-uniform weights, zero biases. Member k depends on `key` and k alone, not on K."""
+    sizes = (state_size + action_size, *hidden, state_size)
+
+    def one(k: Array) -> Networks:
+        keys = jax.random.split(jax.random.fold_in(key, k), len(sizes) - 1)
+        xavier = jax.nn.initializers.glorot_uniform()
+        return tuple(
+            (xavier(layer_key, (fan_in, fan_out)), jnp.zeros((1, fan_out)))
+            for layer_key, fan_in, fan_out in zip(keys, sizes[:-1], sizes[1:], strict=True)
+        )
+
+    return jax.vmap(one)(jnp.arange(members))
+
+
+def normaliser_of(train: Transitions, std_floor: float, unseen: tuple[int, ...] = ()) -> Normaliser:
+    """Means and standard deviations of training data (host arrays, [n, ...]); never of validation data.
+
+    `unseen` state dimensions get scale 0, so that the networks cannot see them.
+    """
+
+    def std(x: Array) -> Array:
+        return jnp.maximum(jnp.std(jnp.asarray(x), axis=0), std_floor)
+
+    state_scale = (1 / std(train.states)).at[jnp.array(unseen, int)].set(0.0)
+    return Normaliser(
+        state_mean=jnp.mean(jnp.asarray(train.states), axis=0),
+        state_scale=state_scale,
+        action_mean=jnp.mean(jnp.asarray(train.actions), axis=0),
+        action_scale=1 / std(train.actions),
+        delta_mean=jnp.mean(jnp.asarray(train.deltas), axis=0),
+        delta_std=std(train.deltas),
+    )
+
+
+def predict(ensemble: Ensemble, states: Array, actions: Array) -> Array:
+    """Next states, each member for its own batch: [K, B, S], [K, B, A] -> [K, B, S]."""
+    return states + predict_delta(ensemble, states, actions)
+
+
+def predict_delta(ensemble: Ensemble, states: Array, actions: Array) -> Array:
+    """Changes of state, each member for its own batch: [K, B, S], [K, B, A] -> [K, B, S]."""
+    n = ensemble.normaliser
+    hidden = jnp.concatenate(
+        [(states - n.state_mean) * n.state_scale, (actions - n.action_mean) * n.action_scale], axis=-1
+    )
+    *inner, (last_weights, last_biases) = ensemble.networks
+    for weights, biases in inner:
+        hidden = jax.nn.relu(jnp.einsum("kbi,kio->kbo", hidden, weights) + biases)
+    output = jnp.einsum("kbi,kio->kbo", hidden, last_weights) + last_biases
+    return n.delta_mean + n.delta_std * output

@@ -1,0 +1,144 @@
+"""Fitting the ensemble: Adam with early stopping, every member on its own minibatches and its own best weights.
+
+Paper, section 4.1 (the L2 one-step loss) and appendix A.1.2 (batch, passes, patience).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from metrpo.config import FitConfig
+from metrpo.model.ensemble import Ensemble, Networks, predict_delta
+from metrpo.types import Array, Normaliser, Transitions
+
+VALIDATION_CHUNK = 1000
+"""Validation transitions per product; bounds memory and keeps shapes fixed as data grows."""
+
+
+class FitInfo(NamedTuple):
+    """What one fit did."""
+
+    passes: int
+    """Passes over the training set."""
+    validation_loss: Array
+    """[K], each member's best, in squared raw state units."""
+    train_loss: Array
+    """[K], of the last minibatches."""
+    best_pass: Array
+    """[K], the pass after which each member was best."""
+
+
+class _Progress(NamedTuple):
+    networks: Networks
+    optimizer: optax.OptState
+    best_networks: Networks
+    best_loss: Array
+    best_pass: Array
+    train_loss: Array
+
+
+def fit(
+    networks: Networks,
+    normaliser: Normaliser,
+    train: Transitions,
+    validation: Transitions,
+    config: FitConfig,
+    key: Array,
+    on_validation: Callable[[int, Array], None] = lambda passes, losses: None,
+) -> tuple[Ensemble, FitInfo]:
+    """The ensemble fitted to `train`, each member at its own best validation loss.
+
+    Stops when no member has improved for `config.patience` passes, at the latest after `config.max_passes`.
+    `on_validation(passes, best losses [K])` is called at every validation. Adam starts afresh.
+    """
+    optimizer = optax.adam(config.learning_rate)
+    loss = validation_loss(Ensemble(networks, normaliser), validation)
+    at = _Progress(networks, optimizer.init(networks), networks, loss, jnp.zeros(loss.shape, jnp.int32), loss)
+    at = jax.tree.map(jnp.copy, at)  # its buffers are given away below, the caller's are not
+    # At least one step a pass: the first iterations of a small task may have fewer transitions than a minibatch.
+    steps = max(1, int(train.size) // config.batch_size) * config.validate_every
+    passes = 0
+    while passes < config.max_passes and passes - int(at.best_pass.max()) < config.patience:
+        passes += config.validate_every
+        at = _train_and_validate(at, normaliser, train, validation, config, key, jnp.int32(steps), jnp.int32(passes))
+        on_validation(passes, at.best_loss)
+    info = FitInfo(passes, at.best_loss, at.train_loss, at.best_pass)
+    return Ensemble(at.best_networks, normaliser), info
+
+
+def loss_of(ensemble: Ensemble, states: Array, actions: Array, deltas: Array) -> Array:
+    """[K, B]: squared error of the predicted change, summed over state dimensions, raw units (paper, eq. 1)."""
+    return jnp.sum(jnp.square(predict_delta(ensemble, states, actions) - deltas), axis=-1)
+
+
+@jax.jit
+def validation_loss(ensemble: Ensemble, validation: Transitions) -> Array:
+    """[K]: mean of `loss_of` over the first `size` validation transitions; the capacity beyond costs nothing."""
+    members = ensemble.members
+    capacity = validation.states.shape[0]
+
+    def chunk_sum(i: Array, total: Array) -> Array:
+        index = i * VALIDATION_CHUNK + jnp.arange(VALIDATION_CHUNK)
+        rows = [jnp.take(x, index, axis=0, mode="clip") for x in validation[:3]]
+        losses = loss_of(ensemble, *(jnp.broadcast_to(x, (members, *x.shape)) for x in rows))
+        return total + jnp.sum(jnp.where(index < jnp.minimum(validation.size, capacity), losses, 0.0), axis=-1)
+
+    chunks = (validation.size + VALIDATION_CHUNK - 1) // VALIDATION_CHUNK
+    return jax.lax.fori_loop(0, chunks, chunk_sum, jnp.zeros(members)) / validation.size
+
+
+@partial(jax.jit, static_argnames="config", donate_argnums=0)
+def _train_and_validate(
+    at: _Progress,
+    normaliser: Normaliser,
+    train: Transitions,
+    validation: Transitions,
+    config: FitConfig,
+    key: Array,
+    steps: Array,
+    passes: Array,
+) -> _Progress:
+    optimizer = optax.adam(config.learning_rate)
+    members = at.best_loss.shape[0]
+    block_key = jax.random.fold_in(key, passes)
+
+    def total_loss(networks: Networks, *batch: Array) -> tuple[Array, Array]:
+        losses = jnp.mean(loss_of(Ensemble(networks, normaliser), *batch), axis=-1)
+        return jnp.sum(losses), losses
+
+    def step(i: Array, carry: tuple[Networks, optax.OptState, Array]) -> tuple[Networks, optax.OptState, Array]:
+        networks, optimizer_state, _ = carry
+        index = minibatch(jax.random.fold_in(block_key, i), members, config.batch_size, train.size)
+        batch = (jnp.take(x, index, axis=0) for x in train[:3])
+        gradient, losses = jax.grad(total_loss, has_aux=True)(networks, *batch)
+        change, optimizer_state = optimizer.update(gradient, optimizer_state)
+        return optax.apply_updates(networks, change), optimizer_state, losses
+
+    start = (at.networks, at.optimizer, at.train_loss)
+    networks, optimizer_state, train_loss = jax.lax.fori_loop(0, steps, step, start)
+    loss = validation_loss(Ensemble(networks, normaliser), validation)
+    better = loss < at.best_loss  # False for NaN: a diverged member keeps its best weights
+
+    def keep_best(new: Array, best: Array) -> Array:
+        return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, best)
+
+    return _Progress(
+        networks,
+        optimizer_state,
+        jax.tree.map(keep_best, networks, at.best_networks),
+        jnp.where(better, loss, at.best_loss),
+        jnp.where(better, passes, at.best_pass),
+        train_loss,
+    )
+
+
+def minibatch(key: Array, members: int, batch_size: int, size: Array) -> Array:
+    """[K, B] indices below `size`, with replacement; member k's depend on `key` and k alone."""
+    keys = jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(members))
+    return jax.vmap(lambda k: jax.random.randint(k, (batch_size,), 0, size))(keys)

@@ -1,0 +1,133 @@
+"""Rollouts through the ensemble: the simulator in which the policy learns (paper, section 5).
+
+Sampling functions choose the next state: (ensemble, states [N, S], actions [N, A], key) -> [N, S]. They stand in
+one table, `SAMPLINGS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from metrpo.model.ensemble import Ensemble, predict
+from metrpo.types import Array, Trajectories
+
+Act = Callable[[Array, Array], Array]
+"""(states [N, S], key) -> actions [N, A]."""
+Reward = Callable[[Array, Array, Array], Array]
+Terminated = Callable[[Array], Array]
+
+EXPLODED = 1e6
+"""A rollout with a state beyond this has diverged, as has one with a state that is not finite."""
+
+
+class ImagineInfo(NamedTuple):
+    """What a batch of imagined rollouts looked like."""
+
+    mean_return: Array
+    """Undiscounted, over the rollouts that did not diverge."""
+    diverged: Array
+    """Share of the rollouts that exploded or met NaN; they are masked out whole."""
+    steps: Array
+    """Steps that count."""
+
+
+def model_choice(key: Array, count: int, members: int) -> tuple[Array, Array]:
+    """A model for each of `count` states, in equal groups: (slots [K, G], model of every state [count]).
+
+    Row k of `slots` holds the states of model k, padded with `count` (an index out of range). States are dealt to the
+    models from a shuffled deck, so each state's model is uniform and independent from step to step, every rollout has
+    the law of independent draws, and K models cost the products of one.
+    """
+    group = -(-count // members)
+    # The deck is shuffled with its blanks, else the last model would be drawn less often than the others.
+    deck = jax.random.permutation(key, group * members)
+    slots = jnp.where(deck < count, deck, count).reshape(members, group)
+    models = jnp.zeros(count, jnp.int32).at[slots].set(jnp.arange(members)[:, None], mode="drop")
+    return slots, models
+
+
+def step_rand(ensemble: Ensemble, states: Array, actions: Array, key: Array) -> Array:
+    """One model drawn at random for each state and step (paper, section 5)."""
+    slots, _ = model_choice(key, states.shape[0], ensemble.members)
+    # The blanks repeat the last state; their predictions are dropped.
+    grouped = predict(
+        ensemble, jnp.take(states, slots, axis=0, mode="clip"), jnp.take(actions, slots, axis=0, mode="clip")
+    )
+    return jnp.zeros_like(states).at[slots].set(grouped, mode="drop")
+
+
+SAMPLINGS: dict[str, Callable[[Ensemble, Array, Array, Array], Array]] = {"step_rand": step_rand}
+
+
+def imagine(
+    ensemble: Ensemble,
+    act: Act,
+    reward: Reward,
+    terminated: Terminated | None,
+    starts: Array,
+    horizon: int,
+    key: Array,
+    sampling: str = "step_rand",
+) -> tuple[Trajectories, ImagineInfo]:
+    """Imagined episodes of `horizon` steps from `starts` [N, S].
+
+    Actions are clipped to [-1, 1] for dynamics and reward, and recorded as drawn.
+    """
+    next_state = SAMPLINGS[sampling]
+
+    def step(carry: tuple[Array, Array, Array], key: Array) -> tuple[tuple[Array, Array, Array], Trajectories]:
+        states, alive, diverged = carry
+        action_key, model_key = jax.random.split(key)
+        actions = act(states, action_key)
+        clipped = jnp.clip(actions, -1.0, 1.0)
+        following = next_state(ensemble, states, clipped, model_key)
+        rewards = reward(states, clipped, following)
+        bad = ~(jnp.all(jnp.abs(following) < EXPLODED, axis=-1) & jnp.isfinite(rewards))
+        recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive)
+        diverged = diverged | (bad & (alive > 0))
+        if terminated is not None:
+            alive = alive * (1.0 - terminated(following))
+        # A diverged rollout stands still, so that it stays finite; it is masked below.
+        following = jnp.where(bad[:, None], states, following)
+        return (following, alive, diverged), recorded
+
+    count = starts.shape[0]
+    carry = (starts, jnp.ones(count), jnp.zeros(count, bool))
+    (_, _, diverged), trajectories = jax.lax.scan(step, carry, jax.random.split(key, horizon))
+    mask = trajectories.mask * (1.0 - diverged)
+    returns = jnp.sum(trajectories.rewards * mask, axis=0)
+    info = ImagineInfo(jnp.sum(returns) / jnp.maximum(jnp.sum(~diverged), 1), jnp.mean(diverged), jnp.sum(mask))
+    return trajectories._replace(mask=mask), info
+
+
+def returns_per_model(
+    ensemble: Ensemble,
+    act: Callable[[Array], Array],
+    reward: Reward,
+    terminated: Terminated | None,
+    starts: Array,
+    horizon: int,
+) -> Array:
+    """[K]: mean return of the deterministic policy `act`, full horizon from `starts` [N, S], in each model alone.
+
+    NaN for a model in which any rollout diverged: such a model cannot vouch for the policy.
+    """
+
+    def step(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
+        states, alive, total = carry
+        actions = jnp.clip(act(states), -1.0, 1.0)
+        following = predict(ensemble, states, actions)
+        total = total + alive * reward(states, actions, following)
+        total = jnp.where(jnp.all(jnp.abs(following) < EXPLODED, axis=-1) | (alive == 0), total, jnp.nan)
+        if terminated is not None:
+            alive = alive * (1.0 - terminated(following))
+        return (following, alive, total), None
+
+    states = jnp.broadcast_to(starts, (ensemble.members, *starts.shape))
+    zeros = jnp.zeros(states.shape[:2])
+    (_, _, total), _ = jax.lax.scan(step, (states, zeros + 1.0, zeros), None, length=horizon)
+    return jnp.mean(total, axis=1)

@@ -1,0 +1,76 @@
+"""Advantages: generalised advantage estimation against a linear-feature baseline (authors' settings)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+
+from metrpo.types import Array, Trajectories
+
+
+def features(states: Array) -> Array:
+    """The baseline's features [o, o^2, t/100, (t/100)^2, (t/100)^3, 1], o clipped to +-10: [T, N, S] -> [T, N, 2S + 4]."""
+    observed = jnp.clip(states, -10.0, 10.0)
+    steps, count, _ = states.shape
+    t = jnp.broadcast_to((jnp.arange(steps, dtype=states.dtype) / 100.0)[:, None, None], (steps, count, 1))
+    return jnp.concatenate([observed, jnp.square(observed), t, t**2, t**3, jnp.ones_like(t)], axis=-1)
+
+
+def init_baseline(state_size: int) -> Array:
+    """A baseline that predicts 0 everywhere: [2S + 4]."""
+    return jnp.zeros(2 * state_size + 4)
+
+
+def fit_baseline(feature: Array, targets: Array, mask: Array, ridge: float) -> Array:
+    """Ridge regression of `targets` [T, N] on `feature` [T, N, F] where `mask` [T, N] is 1: weights [F].
+
+    Solved by the normal equations in the columns' own scale, which float32 needs: squares reach 100 and counts 50,000.
+    """
+    x = (feature * mask[..., None]).reshape(-1, feature.shape[-1])
+    gram = x.T @ x + ridge * jnp.eye(x.shape[1])
+    scale = jax.lax.rsqrt(jnp.diag(gram))
+    # Constant or repeated columns are exactly collinear; the jitter is float32's resolution, below any real signal.
+    scaled = gram * scale * scale[:, None] + 1e-6 * jnp.eye(x.shape[1])
+    weights = scale * jax.scipy.linalg.solve(scaled, scale * (x.T @ (targets * mask).reshape(-1)), assume_a="pos")
+    return jnp.where(jnp.all(jnp.isfinite(weights)), weights, 0.0)
+
+
+def discounted_returns(rewards: Array, mask: Array, discount: float) -> Array:
+    """Return from every step on, [T, N]; steps with mask 0 give and pass on nothing."""
+
+    def step(following: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
+        reward, counts = at
+        value = counts * (reward + discount * following)
+        return value, value
+
+    return jax.lax.scan(step, jnp.zeros(rewards.shape[1]), (rewards, mask), reverse=True)[1]
+
+
+def gae(rewards: Array, values: Array, mask: Array, discount: float, gae_lambda: float) -> Array:
+    """Generalised advantage estimates [T, N] (Schulman et al. 2016); the value after the last step that counts is 0.
+
+    The episode ends there, by termination or by the horizon, which belongs to the task: the return is that of T steps.
+    """
+    following = jnp.concatenate([(values * mask)[1:], jnp.zeros_like(values[:1])])
+    errors = mask * (rewards + discount * following - values)
+    return discounted_returns(errors, mask, discount * gae_lambda)
+
+
+def standardise(advantages: Array, mask: Array) -> Array:
+    """Advantages with mean 0 and standard deviation 1 where `mask` is 1, and 0 elsewhere."""
+    count = jnp.maximum(jnp.sum(mask), 1.0)
+    mean = jnp.sum(advantages * mask) / count
+    variance = jnp.sum(jnp.square(advantages - mean) * mask) / count
+    return mask * (advantages - mean) / (jnp.sqrt(variance) + 1e-8)
+
+
+def advantages_and_baseline(
+    trajectories: Trajectories, baseline: Array, discount: float, gae_lambda: float, ridge: float
+) -> tuple[Array, Array]:
+    """Standardised advantages [T, N] under `baseline`, and the baseline refitted to this batch for the next one."""
+    feature = features(trajectories.states)
+    values = feature @ baseline
+    advantages = gae(trajectories.rewards, values, trajectories.mask, discount, gae_lambda)
+    returns = discounted_returns(trajectories.rewards, trajectories.mask, discount)
+    refitted = fit_baseline(feature, returns, trajectories.mask, ridge)
+    return standardise(advantages, trajectories.mask), refitted

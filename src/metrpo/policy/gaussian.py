@@ -1,0 +1,66 @@
+"""The Gaussian policy: a tanh network for the mean, one log standard deviation per action (paper, appendix A.1.3)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from metrpo.types import Array
+
+
+class Policy(NamedTuple):
+    """Parameters of the policy; a pytree."""
+
+    layers: tuple[tuple[Array, Array], ...]
+    """One (weights [in, out], biases [out]) a layer."""
+    log_std: Array
+    """[A], the same in every state."""
+
+
+def init(key: Array, state_size: int, action_size: int, hidden: tuple[int, ...], initial_std: float) -> Policy:
+    """A fresh policy: Xavier-uniform weights, zero biases."""
+    sizes = (state_size, *hidden, action_size)
+    keys = jax.random.split(key, len(sizes) - 1)
+    xavier = jax.nn.initializers.glorot_uniform()
+    layers = tuple(
+        (xavier(k, (fan_in, fan_out)), jnp.zeros(fan_out))
+        for k, fan_in, fan_out in zip(keys, sizes[:-1], sizes[1:], strict=True)
+    )
+    return Policy(layers, jnp.full(action_size, math.log(initial_std)))
+
+
+def mean(policy: Policy, states: Array) -> Array:
+    """The mean action: [..., S] -> [..., A]. NumPy in, NumPy out (when the parameters are NumPy), likewise JAX."""
+    xp = states.__array_namespace__()
+    *inner, (last_weights, last_biases) = policy.layers
+    hidden = states
+    for weights, biases in inner:
+        hidden = xp.tanh(hidden @ weights + biases)
+    return hidden @ last_weights + last_biases
+
+
+def sample(policy: Policy, states: Array, key: Array) -> Array:
+    """Actions drawn from the policy: [..., S] -> [..., A]."""
+    means = mean(policy, states)
+    return means + jnp.exp(policy.log_std) * jax.random.normal(key, means.shape)
+
+
+def log_probability(means: Array, log_std: Array, actions: Array) -> Array:
+    """log pi(a | s) of `actions` [..., A] under N(means, exp(log_std)^2): [...]."""
+    z = (actions - means) * jnp.exp(-log_std)
+    return -0.5 * jnp.sum(jnp.square(z) + 2 * log_std + math.log(2 * math.pi), axis=-1)
+
+
+def kl(old_means: Array, old_log_std: Array, means: Array, log_std: Array) -> Array:
+    """KL(old || new) in every state: [..., A] -> [...]."""
+    ratio = jnp.exp(2 * (old_log_std - log_std))
+    distance = jnp.square((old_means - means) * jnp.exp(-log_std))
+    return 0.5 * jnp.sum(ratio + distance - 1.0 + 2 * (log_std - old_log_std), axis=-1)
+
+
+def reset_std(policy: Policy, initial_std: float) -> Policy:
+    """The policy with its standard deviation set back, as at the start of every policy phase."""
+    return policy._replace(log_std=jnp.full_like(policy.log_std, math.log(initial_std)))

@@ -1,0 +1,127 @@
+"""Trust-region policy optimization (Schulman et al. 2015): natural gradient by conjugate gradients, then a line search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from metrpo.config import TRPOConfig
+from metrpo.policy import gaussian
+from metrpo.policy.gaussian import Policy
+from metrpo.types import Array
+
+
+class Batch(NamedTuple):
+    """n steps to learn from."""
+
+    states: Array
+    """[n, S]"""
+    actions: Array
+    """[n, A], as drawn."""
+    advantages: Array
+    """[n], standardised."""
+    mask: Array
+    """[n], 1 where the step counts."""
+
+
+class ImproveInfo(NamedTuple):
+    """What one policy update did."""
+
+    kl: Array
+    """Mean KL(old || new); 0 when rejected."""
+    improvement: Array
+    """Gain of the surrogate objective."""
+    accepted: Array
+    """The line search found a step."""
+    backtracks: Array
+    """Tries before the accepted one."""
+    cg_residual: Array
+    """|F x - g| / |g| after the last conjugate-gradient iteration."""
+
+
+def improve(policy: Policy, batch: Batch, config: TRPOConfig) -> tuple[Policy, ImproveInfo]:
+    """One TRPO update on `batch`; the policy unchanged when the line search finds no step that improves within max_kl."""
+    count = jnp.maximum(jnp.sum(batch.mask), 1.0)
+    old_means = gaussian.mean(policy, batch.states)
+    old_log_probability = gaussian.log_probability(old_means, policy.log_std, batch.actions)
+    flat, unravel = ravel_pytree(policy)
+
+    def surrogate_and_kl(new: Policy) -> tuple[Array, Array]:
+        means = gaussian.mean(new, batch.states)
+        ratio = jnp.exp(gaussian.log_probability(means, new.log_std, batch.actions) - old_log_probability)
+        divergence = gaussian.kl(old_means, policy.log_std, means, new.log_std)
+        return jnp.sum(batch.mask * ratio * batch.advantages) / count, jnp.sum(batch.mask * divergence) / count
+
+    gradient = ravel_pytree(jax.grad(lambda p: surrogate_and_kl(p)[0])(policy))[0]
+    product = fisher_product(policy, batch.states, batch.mask, config.damping)
+    direction, residual = conjugate_gradient(
+        lambda v: ravel_pytree(product(unravel(v)))[0], gradient, config.cg_iterations
+    )
+    # F x = g - residual, so x'Fx needs no further product.
+    curvature = jnp.dot(direction, gradient - residual)
+    step = direction * jnp.sqrt(2 * config.max_kl / jnp.maximum(curvature, 1e-12))
+    start = surrogate_and_kl(policy)[0]
+
+    def attempt(i: Array) -> tuple[Array, Array, Array]:
+        candidate = flat + config.backtrack_ratio**i * step
+        surrogate, divergence = surrogate_and_kl(unravel(candidate))
+        # Comparisons with NaN are false: a step into NaN is never accepted.
+        return (surrogate > start) & (divergence <= config.max_kl), surrogate, divergence
+
+    def searching(carry: tuple[Array, tuple[Array, Array, Array]]) -> Array:
+        return ~carry[1][0] & (carry[0] < config.max_backtracks - 1)
+
+    def search(carry: tuple[Array, Any]) -> tuple[Array, tuple[Array, Array, Array]]:
+        return carry[0] + 1, attempt(carry[0] + 1)
+
+    zero = jnp.int32(0)
+    tries, (accepted, surrogate, divergence) = jax.lax.while_loop(searching, search, (zero, attempt(zero)))
+    new = jnp.where(accepted, flat + config.backtrack_ratio**tries * step, flat)
+    norm = jnp.linalg.norm(gradient)
+    return unravel(new), ImproveInfo(
+        kl=jnp.where(accepted, divergence, 0.0),
+        improvement=jnp.where(accepted, surrogate - start, 0.0),
+        accepted=accepted,
+        backtracks=tries,
+        cg_residual=jnp.linalg.norm(residual) / jnp.maximum(norm, 1e-30),
+    )
+
+
+def fisher_product(policy: Policy, states: Array, mask: Array, damping: float) -> Callable[[Policy], Policy]:
+    """v -> (F + damping I) v, F the policy's Fisher matrix averaged over `states` [n, S] where `mask` [n] is 1.
+
+    The Gaussian's Fisher matrix is J' diag(1 / std^2) J for the mean network and 2 I for log_std (Gauss-Newton), which
+    is the Hessian of KL(old || new) at new = old. The network is linearised once for all products.
+    """
+    count = jnp.maximum(jnp.sum(mask), 1.0)
+    weights = mask[:, None] * jnp.exp(-2 * policy.log_std) / count
+    _, forward = jax.linearize(lambda layers: gaussian.mean(policy._replace(layers=layers), states), policy.layers)
+    backward = jax.linear_transpose(forward, policy.layers)
+
+    def product(v: Policy) -> Policy:
+        (layers,) = backward(weights * forward(v.layers))
+        curvature = Policy(layers, 2.0 * v.log_std)
+        return jax.tree.map(lambda c, x: c + damping * x, curvature, v)
+
+    return product
+
+
+def conjugate_gradient(product: Callable[[Array], Array], target: Array, iterations: int) -> tuple[Array, Array]:
+    """Solves product(x) = target from x = 0: (x, residual target - product(x))."""
+
+    def step(_: Array, carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        x, residual, direction, square = carry
+        image = product(direction)
+        # Once solved, direction and residual are 0: the guards keep 0 / 0 out.
+        alpha = square / jnp.maximum(jnp.dot(direction, image), 1e-30)
+        x, residual = x + alpha * direction, residual - alpha * image
+        next_square = jnp.dot(residual, residual)
+        return x, residual, residual + next_square / jnp.maximum(square, 1e-30) * direction, next_square
+
+    start = (jnp.zeros_like(target), target, target, jnp.dot(target, target))
+    x, residual, _, _ = jax.lax.fori_loop(0, iterations, step, start)
+    return x, residual

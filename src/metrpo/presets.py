@@ -1,0 +1,81 @@
+"""The presets: one table, task -> what differs from the defaults of `metrpo.config`.
+
+`paper` holds the paper's values (its appendix A.1) and, where it is silent, its authors' settings; the citations stand
+in `tests/test_presets.py`, which holds every value against them. `fast` reaches the same return soonest on two CPU
+cores; how its values were chosen is in `docs/fast-preset.md`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal, cast
+
+from metrpo.config import Config
+from metrpo.errors import ConfigError
+
+Overrides = dict[str, Any]
+"""Dotted setting -> value."""
+
+PAPER: dict[str, Overrides] = {
+    "Swimmer": {"iterations": 100, "collect.max_train": 100_000, "collect.max_validation": 50_000},
+    "Snake": {"iterations": 100},
+    "Hopper": {"iterations": 100},
+    "HalfCheetah": {"iterations": 100},
+    "Ant": {"iterations": 200},
+    "Humanoid": {
+        "iterations": 400,
+        "collect.steps": 6000,
+        "collect.max_train": 400_000,
+        "policy.hidden": (100, 50, 25),
+        "validate.starts": 32,
+    },
+}
+
+FAST_ALL: Overrides = {
+    "ensemble.hidden": (256, 256),
+    "imagine.steps": 20_000,
+    "validate.starts": 50,
+}
+
+FAST: dict[str, Overrides] = {
+    "Swimmer": {"iterations": 10},
+    "Snake": {"iterations": 20},
+    "Hopper": {"iterations": 20},
+    "HalfCheetah": {"iterations": 20},
+    "Ant": {"iterations": 30},
+    "Humanoid": {"iterations": 30, "collect.steps": 6000, "policy.hidden": (100, 50, 25), "collect.max_train": 400_000},
+}
+
+SAME_AS = {"HopperUpright": "Hopper", "HumanoidStandup": "Humanoid"}
+"""Variants share their task's row."""
+
+
+def preset(task: str, name: str = "fast", **top_level: Any) -> Config:
+    """The config of a preset for a task; `top_level` settings such as `seed=1` on top.
+
+    Raises `ConfigError` for an unknown preset or setting.
+    """
+    if name not in ("fast", "paper"):
+        raise ConfigError(f"preset: expected fast or paper, got {name!r}")
+    row = SAME_AS.get(task, task)
+    overrides = PAPER.get(row, {}) if name == "paper" else FAST_ALL | FAST.get(row, {})
+    config = Config(task=task, preset=cast(Literal["fast", "paper"], name))
+    return override(config, overrides | top_level)
+
+
+def override(config: Config, values: Overrides) -> Config:
+    """The config with dotted settings replaced: `override(config, {"fit.learning_rate": 1e-3})`.
+
+    Raises `ConfigError` for an unknown setting or an impossible value.
+    """
+    for name, value in values.items():
+        config = _replace(config, name.split("."), value, name)
+    return config
+
+
+def _replace(node: Any, path: list[str], value: Any, name: str) -> Any:
+    if not dataclasses.is_dataclass(node) or path[0] not in {f.name for f in dataclasses.fields(node)}:
+        raise ConfigError(f"unknown setting {name!r} (see: metrpo train --help)")
+    if len(path) > 1:
+        value = _replace(getattr(node, path[0]), path[1:], value, name)
+    return dataclasses.replace(cast(Any, node), **{path[0]: value})

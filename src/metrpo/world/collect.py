@@ -1,0 +1,95 @@
+"""Policy x environment -> episodes: the only code that steps a real environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import gymnasium
+import numpy as np
+
+from metrpo.config import CollectConfig
+from metrpo.types import Episode
+from metrpo.world.task import Task
+
+Act = Callable[[np.ndarray], np.ndarray]
+"""State [S] -> action [A], not yet clipped."""
+
+
+def collect(
+    task: Task,
+    draw_mean: Callable[[np.random.Generator], Act],
+    config: CollectConfig,
+    rng: np.random.Generator,
+    on_episode: Callable[[int], None] = lambda steps: None,
+) -> list[Episode]:
+    """Whole episodes of at least `config.steps` steps together, with the paper's exploration (appendix A.1.1).
+
+    `draw_mean(rng)` gives the mean action of an episode's policy (parameter noise is drawn there). Action noise:
+    std ~ U[0, max_std], per episode or per step, times N(0, I). `on_episode(steps so far)` follows every episode.
+    """
+    episodes: list[Episode] = []
+    steps = 0
+    env = task.make_env()
+    try:
+        while steps < config.steps:
+            episodes.append(_episode(env, _explore(draw_mean(rng), config, rng), _seed(rng)))
+            steps += len(episodes[-1].rewards)
+            on_episode(steps)
+    finally:
+        env.close()
+    return episodes
+
+
+def evaluate(task: Task, act: Act, episodes: int, seed: int) -> np.ndarray:
+    """Real, undiscounted returns [episodes] of `act` without any noise, from seeded resets."""
+    rng = np.random.default_rng(seed)
+    env = task.make_env()
+    try:
+        return np.array([_episode(env, act, _seed(rng)).rewards.sum(dtype=np.float64) for _ in range(episodes)])
+    finally:
+        env.close()
+
+
+def reset_states(task: Task, count: int, rng: np.random.Generator) -> np.ndarray:
+    """States [count, S] of fresh resets (real interaction that nobody counts: `imagine.start = "reset"`)."""
+    env = task.make_env()
+    try:
+        return np.array([env.reset(seed=_seed(rng))[0] for _ in range(count)], np.float32)
+    finally:
+        env.close()
+
+
+def _explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
+    def stds() -> Iterator[float]:
+        std = rng.uniform(0.0, config.max_std)
+        while True:
+            yield std
+            if config.std_per == "step":
+                std = rng.uniform(0.0, config.max_std)
+
+    std = stds()
+
+    def act(state: np.ndarray) -> np.ndarray:
+        action = mean(state)
+        return action + next(std) * rng.standard_normal(action.shape)
+
+    return act
+
+
+def _episode(env: gymnasium.Env, act: Act, seed: int) -> Episode:
+    state, _ = env.reset(seed=seed)
+    states, actions, rewards = [state], [], []
+    terminated = truncated = False
+    while not (terminated or truncated):
+        action = np.clip(act(state), -1.0, 1.0).astype(np.float32)
+        state, reward, terminated, truncated, _ = env.step(action)
+        states.append(state)
+        actions.append(action)
+        rewards.append(reward)
+    return Episode(
+        np.array(states, np.float32), np.array(actions, np.float32), np.array(rewards, np.float32), bool(terminated)
+    )
+
+
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(2**31))
