@@ -1,0 +1,67 @@
+"""Model-Ensemble Trust-Region Policy Optimization (Kurutach et al., 2018): control learnt from few real steps.
+
+    real environment --collect--> dataset --fit--> ensemble --imagine--> trajectories
+            ^                                         |                      |
+            +------------- accepted policy <--validate+------ improve <------+
+
+Train with `train(preset("Swimmer"), "runs/swimmer")`, use the result with `load_policy("runs/swimmer")`, judge it with
+`evaluate("runs/swimmer")`; `init` and `step` are the loop's two halves for those who drive it themselves.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from metrpo.config import Config
+from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError, TaskError
+
+if TYPE_CHECKING:
+    from metrpo.algorithm import State, init, step, train
+    from metrpo.evaluation import EvaluationResult, evaluate
+    from metrpo.presets import preset
+    from metrpo.run.metrics import read_metrics
+    from metrpo.run.policy_file import LoadedPolicy, load_policy
+    from metrpo.world.task import Task, get_task, tasks
+
+__all__ = [
+    "Config",
+    "ConfigError",
+    "EvaluationResult",
+    "LoadedPolicy",
+    "MetrpoError",
+    "RunDirectoryError",
+    "State",
+    "Task",
+    "TaskError",
+    "evaluate",
+    "get_task",
+    "init",
+    "load_policy",
+    "preset",
+    "read_metrics",
+    "step",
+    "tasks",
+    "train",
+]
+
+# Imported at first use: a policy can be loaded without JAX, and `import metrpo` costs next to nothing.
+_HOME = {
+    "metrpo.algorithm": ("State", "init", "step", "train"),
+    "metrpo.evaluation": ("EvaluationResult", "evaluate"),
+    "metrpo.presets": ("preset",),
+    "metrpo.run.metrics": ("read_metrics",),
+    "metrpo.run.policy_file": ("LoadedPolicy", "load_policy"),
+    "metrpo.world.task": ("Task", "get_task", "tasks"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _HOME.items():
+        if name in names:
+            return getattr(importlib.import_module(module), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,1 @@
+"""Everything that touches disk or screen: run directories, metrics, policies, curves, videos, progress."""

@@ -1,0 +1,71 @@
+"""Checkpoints: a pytree of arrays and plain numbers, written atomically, checked when read, and free of pickle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from metrpo.errors import RunDirectoryError
+from metrpo.run.files import read_arrays, write_arrays
+
+Tree = TypeVar("Tree")
+
+
+def save_state(path: Path, state: Any, meta: Mapping[str, Any]) -> None:
+    """Writes a pytree of arrays, ints, floats and bools together with JSON-able `meta`.
+
+    Raises `RunDirectoryError` when the file cannot be written, `TypeError` for leaves that only pickle could hold.
+    """
+    arrays = {name: np.asarray(leaf) for name, leaf in _named_leaves(state)}
+    write_arrays(path, arrays, meta)
+
+
+def load_state(path: Path, template: Tree) -> tuple[Tree, dict[str, Any]]:
+    """The pytree and the `meta` that `save_state` wrote.
+
+    `template` gives the structure, kinds and dtypes: NumPy leaves come back as NumPy arrays, JAX leaves as JAX arrays,
+    plain numbers as plain numbers. Shapes are the file's own: a dataset may have grown.
+
+    Raises `DamagedFile` when the file is truncated or edited, `RunDirectoryError` when it is of another format or
+    holds another structure.
+    """
+    arrays, meta = read_arrays(path)
+    expected = dict(_named_leaves(template))
+    wrong = [f"lacks {n}" for n in expected if n not in arrays] + [
+        f"has unknown {n}" for n in arrays if n not in expected
+    ]
+    wrong += [_mismatch(n, leaf, arrays[n]) for n, leaf in expected.items() if n in arrays]
+    wrong = [w for w in wrong if w]
+    if wrong:
+        more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
+        raise RunDirectoryError(
+            f"{path} does not fit this run: expected {len(expected)} arrays, got {len(arrays)}; "
+            f"it {'; it '.join(wrong[:3])}{more}. It was written by metrpo {meta['metrpo']}: use that version, "
+            "or another directory"
+        )
+    leaves = [_like(leaf, arrays[name]) for name, leaf in expected.items()]
+    return jax.tree.unflatten(jax.tree.structure(template), leaves), meta
+
+
+def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
+    return [(jax.tree_util.keystr(path) or "state", leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)]
+
+
+def _mismatch(name: str, leaf: Any, array: np.ndarray) -> str:
+    kind, rank = (leaf.dtype, leaf.ndim) if hasattr(leaf, "dtype") else (np.asarray(leaf).dtype, 0)
+    if (kind, rank) == (array.dtype, array.ndim):
+        return ""
+    return f"has {name} as {array.dtype} of rank {array.ndim} instead of {kind} of rank {rank}"
+
+
+def _like(leaf: Any, array: np.ndarray) -> Any:
+    if isinstance(leaf, int | float):
+        return type(leaf)(array.item())
+    if isinstance(leaf, np.generic):
+        return array[()]
+    return array if isinstance(leaf, np.ndarray) else jnp.asarray(array)

@@ -1,0 +1,112 @@
+"""Claiming a run directory: create or recognise it, lock it, and check its settings before anything is written."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import platform
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import TextIO
+
+from metrpo import config as configs
+from metrpo.config import Config
+from metrpo.errors import ConfigError, RunDirectoryError
+from metrpo.run.files import FORMAT, atomic_write, check_format, metrpo_version
+
+
+def claim(path: Path, config: Config) -> TextIO:
+    """Makes `path` the run directory of `config`, or checks that it is; returns its lock, held until closed.
+
+    Raises `RunDirectoryError` when it cannot be written, is in use by another process, holds something else, a run of
+    another version or one with other settings; nothing in it has been changed then.
+    """
+    _create(path)
+    lock = _lock(path)
+    try:
+        _check_or_describe(path / "run.json")
+        _check_or_write_config(path / "config.json", config, any(path.glob("checkpoints/*.npz")))
+    except BaseException:
+        lock.close()
+        raise
+    return lock
+
+
+def _create(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        foreign = [p.name for p in path.iterdir() if p.name != ".lock" and ".tmp" not in p.name]
+    except OSError as error:
+        raise RunDirectoryError(
+            f"cannot use {path} as a run directory: {error.strerror}; choose a writable one"
+        ) from error
+    if foreign and "run.json" not in foreign:
+        raise RunDirectoryError(
+            f"{path} is no run directory: expected it empty or with a run.json, got {', '.join(sorted(foreign)[:3])}; "
+            "choose another directory"
+        )
+
+
+def _lock(path: Path) -> TextIO:
+    # The kernel drops the lock when the process ends, however it ends: no stale locks to clean up.
+    try:
+        file = open(path / ".lock", "a+")  # noqa: SIM115 - it stays open as long as the run
+    except OSError as error:
+        raise RunDirectoryError(f"cannot write in {path}: {error.strerror}; choose a writable directory") from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        file.seek(0)
+        holder = file.read().strip() or "unknown"
+        file.close()
+        raise RunDirectoryError(
+            f"{path} is in use by another process (pid {holder}): wait for it, end it, or choose another directory"
+        ) from None
+    file.truncate(0)
+    file.write(str(os.getpid()))
+    file.flush()
+    return file
+
+
+def _check_or_describe(file: Path) -> None:
+    if file.exists():
+        try:
+            about = json.loads(file.read_text())
+            check_format(dict(about), file)
+        except (ValueError, TypeError, OSError) as error:
+            raise RunDirectoryError(f"{file} is damaged ({error}): put it back or choose another directory") from None
+        return
+    about = {"format": FORMAT, "metrpo": metrpo_version(), "python": platform.python_version()}
+    about |= {name: version(name) for name in ("jax", "mujoco", "gymnasium", "numpy")}
+    about["created"] = datetime.now(UTC).isoformat(timespec="seconds")
+    atomic_write(file, json.dumps(about, indent=2) + "\n")
+
+
+def _check_or_write_config(file: Path, config: Config, started: bool) -> None:
+    if not file.exists():
+        if started:
+            raise RunDirectoryError(f"{file} is missing: put it back or choose another directory")
+        atomic_write(file, configs.to_json(config))
+        return
+    try:
+        stored = configs.from_json(file.read_text())
+    except (ConfigError, UnicodeDecodeError) as error:
+        raise RunDirectoryError(f"{file} is damaged: {error}; put it back or choose another directory") from None
+    require_same(stored, config, file)
+    if stored != config:
+        atomic_write(file, configs.to_json(config))
+
+
+def require_same(stored: Config, asked: Config, where: Path) -> None:
+    """Raises `RunDirectoryError` with a table of the settings in which `where` differs from what was asked for."""
+    changed = configs.difference(stored, asked)
+    if changed:
+        width = max(len(name) for name in changed)
+        table = "\n".join(
+            f"  {name:<{width}}  directory has {old}, asked for {new}" for name, (old, new) in changed.items()
+        )
+        raise RunDirectoryError(
+            f"{where} holds a run with other settings:\n{table}\nask for the same settings, or choose another directory"
+        )

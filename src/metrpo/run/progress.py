@@ -1,0 +1,146 @@
+"""What a person sees while a run goes on: a live display on a terminal, plain lines elsewhere, or nothing."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from typing import Any, TextIO
+
+from rich import progress as rich_progress
+from rich.console import Console
+
+Row = Mapping[str, Any]
+
+
+class Progress:
+    """Told by the training loop where it stands. This one shows nothing; the others override what they show."""
+
+    def begin(self, iteration: int, of: int | None) -> None:
+        """Outer iteration `iteration` (from 1) of `of` (None: unknown) begins."""
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """A stage such as "fit" begins, of at most `total` units (None: unknown)."""
+
+    def update(self, done: int, note: str = "") -> None:
+        """`done` units of the stage are behind; `note` is a short remark such as a loss."""
+
+    def end(self, row: Row, seconds_left: float | None = None) -> None:
+        """The iteration is finished with these metrics; about so many seconds remain."""
+
+    def close(self) -> None:
+        """The run is over, or breaks off."""
+
+
+SILENT = Progress()
+
+
+class PlainProgress(Progress):
+    """Lines of text for logs: one as a stage begins, one per finished iteration."""
+
+    def __init__(self, out: TextIO | None = None) -> None:
+        self._out = out or sys.stdout
+        self._heading, self._began = "", time.monotonic()
+
+    def begin(self, iteration: int, of: int | None) -> None:
+        """Remembers the iteration; its stages name it."""
+        self._heading, self._began = _heading(iteration, of), time.monotonic()
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Prints the stage's name."""
+        self._print(f"{self._heading}  {time.monotonic() - self._began:6.1f} s  {name}")
+
+    def end(self, row: Row, seconds_left: float | None = None) -> None:
+        """Prints the iteration's results."""
+        self._print(f"{self._heading}  {summary(row)}{_left(seconds_left)}")
+
+    def _print(self, line: str) -> None:
+        print(line, file=self._out, flush=True)
+
+
+class LiveProgress(Progress):
+    """The stage with its bar, last returns and time left, drawn in place; finished iterations stay above as lines."""
+
+    def __init__(self, console: Console | None = None) -> None:
+        self._bars = rich_progress.Progress(
+            rich_progress.SpinnerColumn(),
+            rich_progress.TextColumn("[bold]{task.fields[heading]}"),
+            rich_progress.TextColumn("{task.description:<9}"),
+            rich_progress.BarColumn(bar_width=24),
+            rich_progress.TaskProgressColumn(),
+            rich_progress.TimeElapsedColumn(),
+            rich_progress.TextColumn("[dim]{task.fields[note]}"),
+            console=console or Console(),
+            refresh_per_second=5,
+        )
+        self._heading, self._last = "", ""
+        self._task: rich_progress.TaskID | None = None
+
+    def begin(self, iteration: int, of: int | None) -> None:
+        """Starts the display with the iteration's number."""
+        self._heading = _heading(iteration, of)
+        self._bars.start()
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Starts the stage's bar, which replaces the last stage's."""
+        self._clear()
+        self._task = self._bars.add_task(name, total=total, heading=self._heading, note=self._last)
+
+    def update(self, done: int, note: str = "") -> None:
+        """Moves the bar."""
+        if self._task is not None:
+            self._bars.update(self._task, completed=done, note=note or self._last)
+
+    def end(self, row: Row, seconds_left: float | None = None) -> None:
+        """Leaves a line with the iteration's results above the bar."""
+        self._clear()
+        self._bars.console.print(f"[bold]{self._heading}[/]  {summary(row)}", highlight=False)
+        self._last = f"last return {_number(row.get('return_real'))}{_left(seconds_left)}"
+
+    def close(self) -> None:
+        """Takes the display down; lines of finished iterations stay."""
+        self._clear()
+        self._bars.stop()
+
+    def _clear(self) -> None:
+        if self._task is not None:
+            self._bars.remove_task(self._task)
+        self._task = None
+
+
+def default_progress() -> Progress:
+    """A live display on a terminal, plain lines elsewhere."""
+    return LiveProgress() if sys.stdout.isatty() else PlainProgress()
+
+
+def summary(row: Row) -> str:
+    """One line with the numbers of an iteration that a person follows."""
+    parts = [
+        f"{row.get('real_steps', 0):>7,} real steps",
+        f"return {_number(row.get('return_real')):>7} ± {_number(row.get('return_real_std'))}",
+        f"imagined {_number(row.get('return_imagined')):>7}",
+    ]
+    seconds = sum(v for name, v in row.items() if name.startswith("seconds_") and v is not None)
+    return "   ".join([*parts, duration(seconds)] if seconds else parts)
+
+
+def duration(seconds: float) -> str:
+    """Seconds for people: "42 s", "3 min 05 s", "2 h 10 min"."""
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def _heading(iteration: int, of: int | None) -> str:
+    return f"iteration {iteration}" + (f"/{of}" if of is not None else "")
+
+
+def _left(seconds: float | None) -> str:
+    return "" if seconds is None else f"   about {duration(seconds)} left"
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}"
