@@ -95,8 +95,6 @@ def _check_or_write_config(file: Path, config: Config, started: bool) -> None:
     except (ConfigError, UnicodeDecodeError) as error:
         raise RunDirectoryError(f"{file} is damaged: {error}; put it back or choose another directory") from None
     require_same(stored, config, file)
-    if stored != config:
-        atomic_write(file, configs.to_json(config))
 
 
 def require_same(stored: Config, asked: Config, where: Path) -> None:

@@ -94,6 +94,7 @@ class RunDirectory:
         found = self._checkpoints()
         if not found:
             self._require_fresh()
+            self._write_config()
             return None
         try:
             state, meta = load_state(found[-1], template)
@@ -102,6 +103,7 @@ class RunDirectory:
         require_same(configs.from_json(meta["config"]), self.config, found[-1])
         self.rows = meta["rows"]
         self._wall_seconds_before = self.rows[-1]["wall_seconds"] or 0.0
+        self._write_config()
         self._publish(state)
         return state
 
@@ -136,6 +138,10 @@ class RunDirectory:
                 f"{self.path} has lost its checkpoints: expected one for the {finished} iterations in {metrics.name}, "
                 "got none; put the files back or choose another directory"
             )
+
+    def _write_config(self) -> None:
+        # The budget may be another one than last time.
+        atomic_write(self.path / "config.json", configs.to_json(self.config))
 
     def _publish(self, state: Saved) -> None:
         for old in self._checkpoints()[:-_KEPT]:

@@ -94,7 +94,7 @@ class LiveProgress(Progress):
     def end(self, row: Row, seconds_left: float | None = None) -> None:
         """Leaves a line with the iteration's results above the bar."""
         self._clear()
-        self._bars.console.print(f"[bold]{self._heading}[/]  {summary(row)}", highlight=False)
+        self._bars.console.print(f"[bold]{self._heading}[/]  {summary(row)}", highlight=False, soft_wrap=True)
         self._last = f"last return {_number(row.get('return_real'))}{_left(seconds_left)}"
 
     def close(self) -> None:
@@ -121,7 +121,7 @@ def summary(row: Row) -> str:
         f"imagined {_number(row.get('return_imagined')):>7}",
     ]
     seconds = sum(v for name, v in row.items() if name.startswith("seconds_") and v is not None)
-    return "   ".join([*parts, duration(seconds)] if seconds else parts)
+    return "  ".join([*parts, duration(seconds)] if seconds else parts)
 
 
 def duration(seconds: float) -> str:

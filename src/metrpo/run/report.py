@@ -50,13 +50,15 @@ def draw_curve(rows: Sequence[Row], path: Path, title: str) -> None:
 
 
 def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
-    real, std = _column(rows, "return_real"), _column(rows, "return_real_std")
+    real, std, collected, imagined = (
+        _column(rows, name) for name in ("return_real", "return_real_std", "return_collected", "return_imagined")
+    )
     axes.fill_between(
         steps, real - std, real + std, color=_REAL, alpha=0.15, linewidth=0, label="± 1 std over episodes"
     )
     axes.plot(
         steps,
-        _column(rows, "return_collected"),
+        collected,
         ".--",
         color=_COLLECTED,
         linewidth=1,
@@ -64,7 +66,7 @@ def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
     )
     axes.plot(
         steps,
-        _column(rows, "return_imagined"),
+        imagined,
         "s-",
         color=_IMAGINED,
         linewidth=1.3,
@@ -73,7 +75,19 @@ def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
     )
     axes.plot(steps, real, "o-", color=_REAL, linewidth=2.2, markersize=5, label="real (deterministic policy)")
     axes.set_ylabel("return of an episode")
+    axes.set_ylim(_frame(np.concatenate([real - std, real + std, collected]), imagined))
     axes.legend(loc="best", frameon=False, fontsize=9)
+
+
+def _frame(real: np.ndarray, others: np.ndarray) -> tuple[float, float] | None:
+    """Limits of the return axis: early models may promise a hundredfold, which must not flatten the real curve."""
+    if not np.isfinite(real).any():
+        return None
+    low, high = np.nanmin(real), np.nanmax(real)
+    span = max(high - low, 0.1 * abs(high), 1e-9)
+    everything = np.concatenate([real, others])
+    low, high = max(np.nanmin(everything), low - span), min(np.nanmax(everything), high + span)
+    return float(low - 0.06 * (high - low + 1e-9)), float(high + 0.06 * (high - low + 1e-9))
 
 
 def _draw_gap(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
@@ -89,14 +103,23 @@ def _draw_gap(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
         "^:",
         color=_SHARE,
         markersize=4,
-        label="models improved at the last validation",
+        label="models that a policy update improved",
     )
     share.set_ylim(-5, 105)
     share.set_ylabel("models improved (%)", color=_SHARE)
     share.spines["top"].set_visible(False)
     lines, names = axes.get_legend_handles_labels()
     more, more_names = share.get_legend_handles_labels()
-    axes.legend(lines + more, names + more_names, loc="best", frameon=False, fontsize=9)
+    axes.legend(
+        lines + more,
+        names + more_names,
+        ncols=2,
+        frameon=False,
+        fontsize=9,
+        loc="lower left",
+        bbox_to_anchor=(0, 1),
+        borderaxespad=0.2,
+    )
 
 
 def _tidy(axes: Axes) -> None:

@@ -1,0 +1,148 @@
+"""The command line: `metrpo train | evaluate | render | tasks | doctor`.
+
+Whatever imports JAX or MuJoCo is imported where it is used: help must come at once, and JAX reads its environment
+variables when imported.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from metrpo.config import Config
+from metrpo.errors import MetrpoError
+from metrpo.options import Doctor, Evaluate, Render, Tasks, Train, parse
+
+
+class _Terminated(BaseException):
+    """SIGTERM arrived."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command and returns the exit code: 0, 2 after a wrong input, 130 after Ctrl-C, 143 after SIGTERM."""
+    arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    logging.basicConfig(format="metrpo: %(message)s", level=logging.WARNING)
+    if arguments == ["--version"]:
+        return _version()
+    try:
+        command = parse(arguments)
+        return _COMMANDS[type(command)](command)
+    except MetrpoError as error:
+        print(f"metrpo: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except _Terminated:
+        return 143
+    except BrokenPipeError:  # `metrpo train --help | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except SystemExit as end:  # tyro has printed help (0) or what was wrong (2)
+        return end.code if isinstance(end.code, int) else 2
+
+
+def _train(command: Train) -> int:
+    from metrpo.algorithm import train
+    from metrpo.run.progress import default_progress
+
+    config = Config(**{f.name: getattr(command, f.name) for f in dataclasses.fields(Config)})
+    run_dir = command.run_dir or Path("runs") / f"{config.task}-{config.preset}-seed{config.seed}"
+    signal.signal(signal.SIGTERM, _terminate)
+    progress = default_progress()
+    try:
+        train(config, run_dir, progress)
+        progress.close()
+        _report(run_dir)
+    except (KeyboardInterrupt, _Terminated):
+        progress.close()
+        print(f"metrpo: stopped; {run_dir} keeps every finished iteration. The same command goes on.", file=sys.stderr)
+        raise
+    finally:
+        progress.close()
+    return 0
+
+
+def _report(run_dir: Path) -> None:
+    """Says what the run has earned and where its files lie; a machine that cannot make a video costs the video only."""
+    from metrpo.evaluation import render
+    from metrpo.run.metrics import read_metrics
+    from metrpo.run.video import VideoError
+
+    last = read_metrics(run_dir / "metrics.csv")[-1]
+    print(f"return {last['return_real']:.1f} ± {last['return_real_std']:.1f} after {last['real_steps']:,} real steps")
+    files = {"curve": "curve.png", "metrics": "metrics.csv", "policy": "policy.npz"}
+    for what, name in files.items():
+        print(f"  {what:<8} {run_dir / name}", flush=True)
+    print(f"  {'video':<8} ", end="", flush=True)  # it takes a while
+    try:
+        print(render(run_dir))
+    except VideoError as error:
+        print(f"none: {error}")
+
+
+def _evaluate(command: Evaluate) -> int:
+    from metrpo.evaluation import evaluate
+
+    result = evaluate(command.dir, episodes=command.episodes, seed=command.seed).summary()
+    text = "{task}: return {mean:.2f} ± {std:.2f} (min {min:.2f}, max {max:.2f}) over {episodes} episodes, seed {seed}"
+    print(json.dumps(result) if command.json else text.format(**result))
+    return 0
+
+
+def _render(command: Render) -> int:
+    from metrpo.evaluation import render
+
+    print(render(command.dir, command.out, command.seed))
+    return 0
+
+
+def _tasks(command: Tasks) -> int:
+    from metrpo.world.task import tasks
+
+    columns = ("name", "env_id", "state_size", "action_size", "horizon", "description")
+    rows = [{column: getattr(task, column) for column in columns} for task in tasks().values()]
+    if command.json:
+        print(json.dumps(rows))
+        return 0
+    print(f"{'task':<17} {'states':>6} {'actions':>7} {'steps':>5}  description")
+    for row in rows:
+        print("{name:<17} {state_size:>6} {action_size:>7} {horizon:>5}  {description}".format(**row))
+    return 0
+
+
+def _doctor(command: Doctor) -> int:
+    from metrpo.run import machine
+
+    machine.prepare(None, deterministic=False)
+    from metrpo.run.doctor import diagnose
+
+    found = diagnose()
+    print(json.dumps(dataclasses.asdict(found)) if command.json else found.text())
+    return 1 if found.problems else 0
+
+
+def _version() -> int:
+    from metrpo.run.files import metrpo_version
+
+    print(f"metrpo {metrpo_version()}")
+    return 0
+
+
+def _terminate(*_: object) -> None:
+    raise _Terminated
+
+
+_COMMANDS: dict[type, Callable[[Any], int]] = {
+    Train: _train,
+    Evaluate: _evaluate,
+    Render: _render,
+    Tasks: _tasks,
+    Doctor: _doctor,
+}

@@ -1,0 +1,84 @@
+"""A finished policy in the real environment: what it earns, and how it looks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metrpo.errors import ConfigError
+from metrpo.run.policy_file import LoadedPolicy, load_policy
+from metrpo.run.video import record
+from metrpo.world import collect
+from metrpo.world.task import get_task
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """Real returns of a deterministic policy."""
+
+    task: str
+    seed: int
+    returns: np.ndarray
+    """[episodes]"""
+
+    @property
+    def mean(self) -> float:
+        """Mean return."""
+        return float(np.mean(self.returns))
+
+    @property
+    def std(self) -> float:
+        """Standard deviation over the episodes."""
+        return float(np.std(self.returns))
+
+    def summary(self) -> dict[str, Any]:
+        """The result as plain numbers, for JSON."""
+        return {
+            "task": self.task,
+            "episodes": len(self.returns),
+            "seed": self.seed,
+            "mean": self.mean,
+            "std": self.std,
+            "min": float(np.min(self.returns)),
+            "max": float(np.max(self.returns)),
+            "returns": self.returns.tolist(),
+        }
+
+
+def evaluate(
+    policy: str | Path | LoadedPolicy | Callable[[np.ndarray], np.ndarray],
+    task: str | None = None,
+    episodes: int = 20,
+    seed: int = 0,
+) -> EvaluationResult:
+    """Plays whole real episodes with a policy: a run directory, what `load_policy` gives, or any function [S] -> [A].
+
+    `task` is needed for a plain function only. The same seed gives the same start states.
+
+    Raises `RunDirectoryError` when the directory holds no sound policy, `TaskError` for an unknown task, `ConfigError`
+    for fewer than one episode or a function without a task.
+    """
+    if episodes < 1:
+        raise ConfigError(f"episodes: expected at least 1, got {episodes}")
+    if seed < 0:
+        raise ConfigError(f"seed: expected at least 0, got {seed}")
+    act = load_policy(policy) if isinstance(policy, str | Path) else policy
+    name = task or (act.info.task if isinstance(act, LoadedPolicy) else None)
+    if name is None:
+        raise ConfigError("task: expected the task that this function is to be evaluated on, got none")
+    known = get_task(name)
+    return EvaluationResult(known.name, seed, collect.evaluate(known, act, episodes, seed))
+
+
+def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0) -> Path:
+    """Records one real episode of a run's policy, by default to `video.mp4` in the run directory; returns the file.
+
+    Raises `RunDirectoryError` when the directory holds no sound policy, `VideoError` when this machine cannot render,
+    encode or write it.
+    """
+    policy = load_policy(run_dir)
+    return record(get_task(policy.info.task).make_env, policy, Path(out or Path(run_dir) / "video.mp4"), seed)

@@ -1,0 +1,157 @@
+"""What can be typed: every command with its options, as dataclasses that tyro makes into parsers."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, cast
+
+import tyro
+from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, arg, subcommand
+
+from metrpo.config import Config
+
+_BUDGET = tyro.conf.create_mutex_group(required=False)
+
+
+@dataclass(frozen=True)
+class Train(Config):
+    """Learn a task, or go on with a run: the same command on the same directory resumes it.
+
+    Every setting below starts from the task's preset. For example:
+        metrpo train Swimmer
+        metrpo train HalfCheetah --seed 1 --real-steps 60000 --run-dir runs/cheetah
+        metrpo train Swimmer --preset paper --ensemble.members 10 --trpo.max-kl 0.02 --ensemble.hidden 512 512
+    """
+
+    task: Annotated[Positional[str], arg(metavar="TASK")] = "Swimmer"
+    """Name of the task (see: metrpo tasks)."""
+    preset: Literal["fast", "paper"] = "fast"
+    """What all other settings start from: the paper's values, or what learns soonest on two CPU cores."""
+    iterations: Annotated[int, _BUDGET] = 10
+    """Outer iterations; may be raised later to go on with a finished run."""
+    real_steps: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
+    """Instead of --iterations: go on until this many real steps have been collected."""
+    run_dir: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Where the run lives; default: runs/<task>-<preset>-seed<seed>."""
+    device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="{cpu,gpu}")] = None
+    """Where JAX computes; default: a GPU if JAX can use one."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Play real episodes with a run's policy, without noise, and report what they earn.
+
+    For example:
+        metrpo evaluate runs/Swimmer-fast-seed0
+        metrpo evaluate runs/Swimmer-fast-seed0 --episodes 100 --seed 7 --json
+    """
+
+    dir: Annotated[Positional[Path], arg(metavar="DIR")]
+    """The run directory."""
+    episodes: int = 20
+    """How many."""
+    seed: int = 0
+    """Decides the start states."""
+    json: bool = False
+    """Print JSON."""
+
+
+@dataclass(frozen=True)
+class Render:
+    """Record one real episode of a run's policy as a video.
+
+    For example:
+        metrpo render runs/Swimmer-fast-seed0
+        metrpo render runs/Swimmer-fast-seed0 --out swim.gif --seed 3
+    """
+
+    dir: Annotated[Positional[Path], arg(metavar="DIR")]
+    """The run directory."""
+    out: Annotated[Path | None, arg(metavar="FILE")] = None
+    """File to write, .mp4 or .gif; default: video.mp4 in the run directory."""
+    seed: int = 0
+    """Decides the start state."""
+
+
+@dataclass(frozen=True)
+class Tasks:
+    """List the tasks that can be learnt.
+
+    For example:
+        metrpo tasks
+        metrpo tasks --json
+    """
+
+    json: bool = False
+    """Print JSON."""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Check this machine: versions, devices, OpenGL and the video encoder, and say what to install.
+
+    The exit code is 0 when training can work. For example:
+        metrpo doctor
+        metrpo doctor --json
+    """
+
+    json: bool = False
+    """Print JSON."""
+
+
+Command = Train | Evaluate | Render | Tasks | Doctor
+
+_DESCRIPTION = """Model-Ensemble Trust-Region Policy Optimization: control learnt from few real steps.
+
+Start with: metrpo train Swimmer. It ends by naming the learning curve and the video.
+"metrpo COMMAND --help" explains a command; "metrpo --version" prints the version."""
+
+
+def parse(arguments: list[str]) -> Command:
+    """The command as typed; for `train`, with the task's preset as the defaults.
+
+    Raises `SystemExit` after printing help or what is wrong, `MetrpoError` for an impossible value or an unknown task.
+    """
+    from metrpo.presets import preset
+
+    if arguments[0] != "train":
+        return _with_defaults(Train(), arguments)
+    # Which defaults? That is among the arguments: they are read twice.
+    any_task, first = _defaults(preset("Swimmer")), None
+    with contextlib.suppress(SystemExit):
+        first = cast(Train, _with_defaults(any_task, [a for a in arguments if a not in ("-h", "--help")], quiet=True))
+    if first is None:
+        return _with_defaults(any_task, arguments)
+    from metrpo.run import machine
+
+    machine.prepare(first.device, first.deterministic)
+    from metrpo.world.task import get_task
+
+    task = get_task(first.task).name
+    parsed = _with_defaults(_defaults(preset(task, first.preset)), arguments)
+    return dataclasses.replace(cast(Train, parsed), task=task)
+
+
+def _defaults(config: Config) -> Train:
+    return Train(**{f.name: getattr(config, f.name) for f in dataclasses.fields(Config)} | {"task": tyro.MISSING})
+
+
+def _with_defaults(train: Train, arguments: list[str], quiet: bool = False) -> Command:
+    commands: Any = (
+        Annotated[Train, subcommand("train", default=train)]
+        | Annotated[Evaluate, subcommand("evaluate")]
+        | Annotated[Render, subcommand("render")]
+        | Annotated[Tasks, subcommand("tasks")]
+        | Annotated[Doctor, subcommand("doctor")]
+    )
+    return tyro.cli(
+        commands,
+        prog="metrpo",
+        description=_DESCRIPTION,
+        args=arguments,
+        console_outputs=not quiet,
+        config=(OmitSubcommandPrefixes, FlagCreatePairsOff),
+    )

@@ -1,0 +1,61 @@
+"""The machine: environment variables that must stand before JAX and NumPy are imported."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+from metrpo.errors import MetrpoError
+
+INSTALL_GPU = "pip install 'metrpo[gpu]' (NVIDIA, CUDA 12)"
+
+
+def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
+    """Sets JAX's environment variables; those already set by the user stay, but for what the arguments demand.
+
+    Must run before JAX and NumPy are imported. `deterministic` takes XLA down to one thread. Compiled code
+    is kept between processes in $JAX_COMPILATION_CACHE_DIR (default: metrpo/jax in the user's cache directory).
+
+    Raises `MetrpoError` when `device` is "gpu" and JAX finds none.
+    """
+    if device is not None:
+        os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda"}[device]
+    elif not _may_have_gpu():
+        os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    if deterministic:
+        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false".strip()
+        os.environ["NPROC"] = "1"  # the size of XLA's thread pool; no XLA flag sets it
+        os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(caches / "metrpo" / "jax"))
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    if device == "gpu":
+        _require_gpu()
+
+
+def _require_gpu() -> None:
+    import jax
+
+    try:
+        jax.devices()
+    except RuntimeError as error:
+        raise MetrpoError(
+            f"device: expected a GPU that JAX can use, got none ({error}); {INSTALL_GPU}, or use --device cpu"
+        ) from None
+
+
+def _may_have_gpu() -> bool:
+    return (
+        sys.platform != "linux"
+        or (has_nvidia() and find_spec("jax_cuda12_plugin") is not None)
+        or Path("/dev/kfd").exists()
+    )
+
+
+def has_nvidia() -> bool:
+    """Whether this machine has an NVIDIA GPU with its driver."""
+    return Path("/dev/nvidiactl").exists()

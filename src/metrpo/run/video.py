@@ -1,0 +1,143 @@
+"""One real episode of a policy as a video, and whether this machine can make one."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metrpo.errors import MetrpoError
+from metrpo.run.files import temporary_path
+
+INSTALL_ENCODER = "pip install 'metrpo[video]'"
+INSTALL_GL = "apt install libosmesa6 (software) or libegl1 (GPU), then set MUJOCO_GL=osmesa or MUJOCO_GL=egl"
+
+
+class VideoError(MetrpoError):
+    """This machine lacks what a video needs; the message says what to install."""
+
+
+def record(make_env: Callable[..., Any], policy: Callable[[np.ndarray], np.ndarray], path: Path, seed: int = 0) -> Path:
+    """Renders one episode, started with `seed`, to `path` (.mp4, or .gif) and returns it.
+
+    `make_env(render_mode="rgb_array")` gives a Gymnasium environment; `policy` maps [S] -> [A].
+
+    Raises `VideoError` when there is no OpenGL or no encoder, or the file cannot be written.
+    """
+    writers = {".mp4": _write_mp4, ".gif": _write_gif}
+    if path.suffix not in writers:
+        raise VideoError(f"{path}: expected a file name that ends in .mp4 or .gif")
+    if path.suffix == ".mp4" and not has_encoder():
+        raise VideoError(f"no video encoder: {INSTALL_ENCODER}, or choose a .gif")
+    frames, fps = _episode(make_env, policy, seed)
+    temporary = temporary_path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writers[path.suffix](temporary, frames, fps)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise VideoError(f"cannot write {path}: {error}") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+    return path
+
+
+def has_encoder() -> bool:
+    """Whether imageio-ffmpeg is installed and finds an ffmpeg (it brings its own on most systems)."""
+    try:
+        import imageio_ffmpeg  # the extra `video`
+
+        return bool(imageio_ffmpeg.get_ffmpeg_exe())
+    except (ImportError, RuntimeError):
+        return False
+
+
+def gl_backend() -> str | None:
+    """The OpenGL backend that renders here: $MUJOCO_GL or the first that works of OSMesa, EGL and GLFW.
+
+    Each is tried in a process of its own: MuJoCo settles for one when imported, and a broken driver may crash.
+    """
+    asked = os.environ.get("MUJOCO_GL")
+    candidates = [asked] if asked else ["osmesa", "egl", "glfw"]
+    return next((name for name in candidates if _renders(name)), None)
+
+
+_PROBE = """
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><light pos='0 0 3'/><geom size='1'/></worldbody></mujoco>")
+with mujoco.Renderer(model, 16, 16) as renderer:
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    renderer.update_scene(data)
+    assert renderer.render().any()
+"""
+
+
+def _renders(backend: str) -> bool:
+    environment = os.environ | {"MUJOCO_GL": backend}
+    return subprocess.run([sys.executable, "-c", _PROBE], env=environment, capture_output=True).returncode == 0
+
+
+def _episode(
+    make_env: Callable[..., Any], policy: Callable[[np.ndarray], np.ndarray], seed: int
+) -> tuple[list[Any], int]:
+    env = make_env(render_mode="rgb_array")
+    try:
+        observation, _ = env.reset(seed=seed)
+        frames, over = [_frame(env)], False
+        while not over:
+            observation, _, terminated, truncated, _ = env.step(policy(observation))
+            over = terminated or truncated
+            frames.append(_frame(env))
+        return frames, int(env.metadata.get("render_fps", 30))
+    finally:
+        env.close()
+
+
+def _frame(env: Any) -> np.ndarray:
+    try:
+        picture = env.render()
+    except MetrpoError:
+        raise
+    except Exception as error:  # every GL library fails in its own way
+        raise VideoError(
+            f"cannot render here ({type(error).__name__}: {error}): {INSTALL_GL}; see: metrpo doctor"
+        ) from error
+    height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2  # what yuv420p can hold
+    return np.ascontiguousarray(picture[:height, :width])
+
+
+def _write_mp4(path: Path, frames: list[np.ndarray], fps: int) -> None:
+    import imageio_ffmpeg  # the extra `video`
+
+    height, width, _ = frames[0].shape
+    # H.264 in yuv420p, the default, with its index at the start: what every browser plays.
+    writer = imageio_ffmpeg.write_frames(
+        str(path), (width, height), fps=fps, macro_block_size=2, output_params=["-movflags", "+faststart"]
+    )
+    with warnings.catch_warnings():
+        # It forks only to become ffmpeg at once, which JAX's threads survive.
+        warnings.filterwarnings("ignore", message=".*os.fork", category=RuntimeWarning)
+        writer.send(None)
+    try:
+        for frame in frames:
+            writer.send(frame)
+    finally:
+        writer.close()
+
+
+def _write_gif(path: Path, frames: list[np.ndarray], fps: int) -> None:
+    from PIL import Image  # comes with matplotlib
+
+    # Browsers slow down frames shorter than 20 ms.
+    step = max(1, round(fps / 25))
+    pictures = [Image.fromarray(frame).quantize(64) for frame in frames[::step]]
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=1000 * step / fps, loop=0, optimize=True)

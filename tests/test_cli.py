@@ -1,0 +1,334 @@
+"""The command line: wrong input gets one clear message and exit code 2, and leaves every file as it was."""
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import types
+from pathlib import Path
+from typing import Any, NamedTuple
+from unittest import mock
+
+import numpy as np
+import pytest
+
+import metrpo
+from metrpo.cli import main
+from metrpo.config import Config
+from metrpo.presets import preset
+from metrpo.run import directory, doctor, machine
+from metrpo.run.directory import RunDirectory
+from metrpo.run.policy_file import load_policy
+from metrpo.run.video import VideoError
+
+
+class Weights(NamedTuple):
+    layers: tuple
+    log_std: Any
+
+
+class State(NamedTuple):
+    iteration: int
+    real_steps: int
+    policy: Weights
+
+
+def a_state(iteration: int) -> State:
+    layers = ((np.zeros((10, 2), np.float32), np.full(2, 0.1, np.float32)),)
+    return State(iteration, 200 * iteration, Weights(layers, np.zeros(2, np.float32)))
+
+
+def train(config: Config, run_dir: Path, progress: Any) -> None:
+    """Stands in for algorithm.train: learns nothing, but keeps its promises to the disk."""
+    with RunDirectory(run_dir, config) as run:
+        state = run.load(a_state(0)) or a_state(0)
+        while state.iteration < config.iterations:
+            progress.begin(state.iteration + 1, config.iterations)
+            state = a_state(state.iteration + 1)
+            row = {
+                "iteration": state.iteration,
+                "real_steps": state.real_steps,
+                "return_real": 1.5,
+                "return_real_std": 0.5,
+            }
+            progress.end(run.save(state, row))
+
+
+@pytest.fixture(autouse=True)
+def _stubs(monkeypatch, tmp_path):
+    stub = types.ModuleType("metrpo.algorithm")
+    stub.train = train  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "metrpo.algorithm", stub)
+    monkeypatch.setattr(directory, "draw_curve", lambda rows, path, title: None)
+    monkeypatch.setattr("metrpo.evaluation.record", lambda make_env, policy, path, seed: path)
+    monkeypatch.chdir(tmp_path)
+    handler = signal.getsignal(signal.SIGTERM)
+    with mock.patch.dict(os.environ):
+        yield
+    signal.signal(signal.SIGTERM, handler)
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(path)): p.read_bytes() for p in path.rglob("*") if p.is_file() and p.name != ".lock"}
+
+
+def run(*arguments: str) -> int:
+    return main(arguments)
+
+
+def test_train_ends_by_naming_its_files(capsys):
+    assert run("train", "swimmer", "--iterations", "2") == 0
+    out = capsys.readouterr().out
+    base = "runs/Swimmer-fast-seed0"
+    for text in (
+        "return 1.5 ± 0.5 after 400 real steps",
+        f"{base}/curve.png",
+        f"{base}/policy.npz",
+        f"{base}/video.mp4",
+    ):
+        assert text in out
+    assert load_policy(base).info.task == "Swimmer"
+
+
+def test_the_same_command_goes_on_and_a_larger_budget_too(capsys):
+    assert run("train", "Swimmer", "--iterations", "2", "--run-dir", "a") == 0
+    assert run("train", "Swimmer", "--iterations", "3", "--run-dir", "a") == 0
+    assert "iteration 3/3" in capsys.readouterr().out
+    assert [row["iteration"] for row in metrpo.read_metrics("a/metrics.csv")] == [1, 2, 3]
+
+
+def test_settings_start_from_the_preset_of_the_task():
+    options = ["--seed", "4", "--preset", "paper", "--ensemble.members", "10", "--trpo.max-kl", "0.02"]
+    options += ["--ensemble.hidden", "256", "128", "--collect.steps", "200", "--iterations", "1", "--deterministic"]
+    assert run("train", "HALFCHEETAH", *options, "--run-dir", "a") == 0
+    expected = preset("HalfCheetah", "paper", seed=4, iterations=1, deterministic=True)
+    expected = dataclasses.replace(
+        expected,
+        ensemble=dataclasses.replace(expected.ensemble, members=10, hidden=(256, 128)),
+        trpo=dataclasses.replace(expected.trpo, max_kl=0.02),
+        collect=dataclasses.replace(expected.collect, steps=200),
+    )
+    assert json.loads(Path("a/config.json").read_text()) == json.loads(json.dumps(dataclasses.asdict(expected)))
+
+
+WRONG = [
+    (["train", "Swimer"], "unknown task 'Swimer': did you mean Swimmer"),
+    (["train", "Swimmer", "--ensemble.members", "0"], "ensemble.members: expected at least 1, got 0"),
+    (["train", "Swimmer", "--ensemble.members", "many"], "--ensemble.members"),
+    (["train", "Swimmer", "--ensemble.member", "3"], "--ensemble.members INT"),
+    (["train", "Swimmer", "--trpo.max-kl", "nan"], "trpo.max_kl: expected a finite number > 0, got nan"),
+    (["train", "Swimmer", "--preset", "slow"], "--preset"),
+    (["train", "Swimmer", "--config.task", "Ant"], "--config.task"),
+    (["train", "Swimmer", "--task", "Ant"], "--task"),
+    (["train", "Swimmer", "--iterations", "3", "--real-steps", "100"], "not allowed together"),
+    (["train"], "TASK"),
+    (["train", "Swimmer", "--seed"], "--seed"),
+    (["frobnicate"], "frobnicate"),
+    (["evaluate", "nowhere"], "nowhere holds no policy"),
+    (["render", "nowhere"], "nowhere holds no policy"),
+    (["evaluate"], "DIR"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), WRONG)
+def test_wrong_input_is_one_message_and_exit_code_2(capsys, tmp_path, arguments, message):
+    assert run(*arguments) == 2
+    out, err = capsys.readouterr()
+    assert message in err
+    assert out == ""
+    assert "Traceback" not in err
+    assert not any(tmp_path.iterdir())
+
+
+def test_an_unwritable_directory_is_one_message(capsys, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    assert run("train", "Swimmer", "--run-dir", "file/run") == 2
+    assert "metrpo: cannot use file/run as a run directory: Not a directory" in capsys.readouterr().err
+    assert contents(tmp_path) == {"file": b"mine"}
+
+
+@pytest.mark.parametrize(
+    ("damage", "arguments", "message"),
+    [
+        (lambda p: None, ["--trpo.max-kl", "0.02"], "trpo.max_kl  directory has 0.01, asked for 0.02"),
+        (lambda p: None, ["--preset", "paper"], "asked for paper"),
+        (
+            lambda p: (p / "run.json").write_text('{"format": 9, "metrpo": "7.0"}'),
+            [],
+            "has format 9 (written by metrpo 7.0)",
+        ),
+        (
+            lambda p: os.truncate(p / "checkpoints/iteration-00002.npz", 99),
+            [],
+            "delete a/checkpoints/iteration-00002.npz",
+        ),
+        (lambda p: (p / "checkpoints/iteration-00002.npz").write_bytes(b"PK"), [], "is damaged (truncated or edited)"),
+        (lambda p: (p / "config.json").write_text("?"), [], "config.json is damaged"),
+    ],
+)
+def test_a_directory_that_does_not_fit_is_left_as_it_was(capsys, tmp_path, damage, arguments, message):
+    assert run("train", "Swimmer", "--iterations", "2", "--run-dir", "a") == 0
+    damage(tmp_path / "a")
+    before = contents(tmp_path)
+    capsys.readouterr()
+    assert run("train", "Swimmer", "--iterations", "3", "--run-dir", "a", *arguments) == 2
+    out, err = capsys.readouterr()
+    assert (message in err, out) == (True, "")
+    assert err.count("metrpo: ") == 1
+    assert contents(tmp_path) == before
+
+
+def test_evaluate_prints_the_returns(capsys):
+    run("train", "Swimmer", "--iterations", "1", "--run-dir", "a")
+    capsys.readouterr()
+    assert run("evaluate", "a", "--episodes", "3", "--seed", "5", "--json") == 0
+    result = json.loads(capsys.readouterr().out)
+    assert len(result["returns"]) == result["episodes"] == 3
+    assert result["mean"] == pytest.approx(np.mean(result["returns"]))
+    assert (result["min"], result["max"]) == (min(result["returns"]), max(result["returns"]))
+    assert metrpo.evaluate("a", episodes=3, seed=5).summary() == result
+    assert run("evaluate", "a", "--episodes", "3", "--seed", "5") == 0
+    assert f"return {result['mean']:.2f} ± {result['std']:.2f}" in capsys.readouterr().out
+    assert run("evaluate", "a", "--episodes", "0") == 2
+    assert "episodes: expected at least 1, got 0" in capsys.readouterr().err
+
+
+def test_evaluating_a_function_needs_a_task():
+    with pytest.raises(metrpo.ConfigError, match="expected the task"):
+        metrpo.evaluate(lambda state: np.zeros(2))
+    assert metrpo.evaluate(lambda state: np.zeros(2), "swimmer", episodes=1).task == "Swimmer"
+
+
+def test_render_names_its_file(capsys):
+    run("train", "Swimmer", "--iterations", "1", "--run-dir", "a")
+    capsys.readouterr()
+    assert run("render", "a", "--out", "swim.gif") == 0
+    assert capsys.readouterr().out == "swim.gif\n"
+
+
+def test_no_video_costs_the_video_only(capsys, monkeypatch):
+    def broken(*_: Any) -> Path:
+        raise VideoError("no video encoder: install it")
+
+    monkeypatch.setattr("metrpo.evaluation.record", broken)
+    assert run("train", "Swimmer", "--iterations", "1", "--run-dir", "a") == 0
+    assert "video    none: no video encoder: install it" in capsys.readouterr().out
+    assert run("render", "a") == 2
+    assert capsys.readouterr().err == "metrpo: no video encoder: install it\n"
+
+
+def test_tasks_lists_them(capsys):
+    assert run("tasks", "--json") == 0
+    rows = json.loads(capsys.readouterr().out)
+    assert {row["name"] for row in rows} == set(metrpo.tasks())
+    assert run("tasks") == 0
+    assert all(name in capsys.readouterr().out for name in ["HalfCheetah"])
+
+
+def test_doctor_finds_what_is_here_and_what_is_missing(capsys, monkeypatch):
+    monkeypatch.setattr(doctor.video, "gl_backend", lambda: None)
+    assert run("doctor", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["versions"]["jax"]
+    assert found["devices"]
+    assert "no OpenGL" in found["hints"][0]
+    monkeypatch.setitem(sys.modules, "optax", None)
+    assert run("doctor") == 1
+    out = capsys.readouterr().out
+    assert "problem: optax does not import" in out
+    assert "training cannot work here" in out
+
+
+@pytest.mark.parametrize("command", ["", "train", "evaluate", "render", "tasks", "doctor"])
+def test_every_help_has_examples(capsys, command):
+    assert run(*command.split(), "--help") == 0
+    out = capsys.readouterr().out
+    assert f"metrpo {command or 'train Swimmer'}" in out.replace("usage: metrpo", "")
+    assert "(default: " in out or not command
+
+
+def test_help_shows_the_defaults_of_task_and_preset(capsys):
+    assert run("train", "Humanoid", "--preset", "paper", "--help") == 0
+    out = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "(default: 100 50 25)" in out
+    assert run("train", "Swimmer", "--help") == 0
+    assert "(default: 32 32)" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+
+
+def test_version_and_no_arguments(capsys):
+    assert run("--version") == 0
+    assert capsys.readouterr().out.startswith("metrpo ")
+    with mock.patch.object(sys, "argv", ["metrpo"]):
+        assert main() == 0
+    assert "usage: metrpo" in capsys.readouterr().out
+
+
+def test_help_comes_without_jax_and_mujoco():
+    code = "import sys; from metrpo.cli import main; main(['--help']); main(['evaluate', '--help']); "
+    code += "print([m for m in ('jax', 'mujoco', 'gymnasium', 'numpy') if m in sys.modules])"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines()[-1] == "[]"
+
+
+def test_the_environment_is_ready_before_jax(monkeypatch, tmp_path):
+    for name in ("JAX_PLATFORMS", "XLA_FLAGS", "NPROC", "JAX_COMPILATION_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(machine, "_may_have_gpu", lambda: False)
+    machine.prepare(None, deterministic=False)
+    assert os.environ["JAX_PLATFORMS"] == "cpu"
+    assert os.environ["JAX_COMPILATION_CACHE_DIR"] == str(tmp_path / "metrpo" / "jax")
+    assert "XLA_FLAGS" not in os.environ
+    monkeypatch.setenv("XLA_FLAGS", "--xla_mine=1")
+    monkeypatch.setenv("JAX_PLATFORMS", "tpu")
+    machine.prepare(None, deterministic=True)
+    assert os.environ["XLA_FLAGS"] == "--xla_mine=1 --xla_cpu_multi_thread_eigen=false"
+    assert (os.environ["JAX_PLATFORMS"], os.environ["NPROC"]) == ("tpu", "1")
+    machine.prepare("cpu", deterministic=False)
+    assert os.environ["JAX_PLATFORMS"] == "cpu"
+
+
+def test_deterministic_leaves_xla_one_thread():
+    code = (
+        "import os; from metrpo.run.machine import prepare; prepare('cpu', True); "
+        "import jax.numpy as jnp; jnp.ones(3).sum(); "
+        "print(sum('XLA' in open(f'/proc/self/task/{t}/comm').read() for t in os.listdir('/proc/self/task')))"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (ran.stdout, ran.stderr) == ("1\n", "")
+
+
+def test_no_gpu_is_one_message(capsys, monkeypatch):
+    def none() -> None:
+        raise RuntimeError("no cuda")
+
+    monkeypatch.setattr("jax.devices", none)
+    assert run("train", "Swimmer", "--device", "gpu") == 2
+    assert "device: expected a GPU that JAX can use, got none (no cuda)" in capsys.readouterr().err
+
+
+STOPPED = """
+import sys, time, types
+stub = types.ModuleType("metrpo.algorithm")
+def train(config, run_dir, progress):
+    progress.begin(1, 2)
+    print("training", flush=True)
+    time.sleep(60)
+stub.train = train
+sys.modules["metrpo.algorithm"] = stub
+from metrpo.cli import main
+sys.exit(main(["train", "Swimmer", "--run-dir", "a"]))
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_run_says_how_to_go_on(number, code):
+    command = [sys.executable, "-c", STOPPED]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "training\n"
+        process.send_signal(number)
+        _, err = process.communicate(timeout=30)
+    assert process.returncode == code
+    assert err == "metrpo: stopped; a keeps every finished iteration. The same command goes on.\n"

@@ -1,0 +1,105 @@
+"""A saved policy acts as the trained one did, in NumPy alone."""
+
+import hashlib
+import json
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+from metrpo.errors import RunDirectoryError
+from metrpo.policy import gaussian
+from metrpo.run.files import write_arrays
+from metrpo.run.policy_file import load_policy, save_policy
+
+S, A, HIDDEN = 5, 2, (8, 6)
+
+
+@pytest.fixture
+def policy():
+    return gaussian.init(jax.random.key(0), S, A, HIDDEN, 1.0)
+
+
+@pytest.fixture
+def loaded(policy, tmp_path):
+    save_policy(tmp_path, policy, "Swimmer", 3, 900, 12.5)
+    return load_policy(tmp_path)
+
+
+@pytest.mark.parametrize("shape", [(S,), (1, S), (7, S), (0, S)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_it_is_the_clipped_mean_of_the_trained_policy(policy, loaded, shape, dtype):
+    observations = 10 * np.random.default_rng(0).standard_normal(shape).astype(dtype)
+    actions = loaded(observations)
+    expected = np.clip(gaussian.mean(policy, jax.numpy.asarray(observations, np.float32)), -1, 1)
+    assert (actions.dtype, actions.shape) == (np.float32, (*shape[:-1], A))
+    np.testing.assert_allclose(actions, expected, atol=1e-5)
+
+
+def test_actions_are_clipped_and_repeatable(policy, tmp_path):
+    loud = policy._replace(layers=jax.tree.map(lambda w: 50 * w, policy.layers))
+    save_policy(tmp_path, loud, "Swimmer", 1, 1, None)
+    observations = np.random.default_rng(0).standard_normal((50, S))
+    actions = load_policy(tmp_path)(observations)
+    assert np.abs(actions).max() == 1
+    np.testing.assert_array_equal(actions, load_policy(tmp_path)(observations))
+
+
+@pytest.mark.parametrize("shape", [(), (S + 1,), (4, S + 1), (2, 3, S), (S, 1)])
+def test_other_shapes_say_what_was_expected(loaded, shape):
+    with pytest.raises(ValueError, match=r"expected shape \[5\] or \[B, 5\], got \[") as error:
+        loaded(np.zeros(shape))
+    assert str(list(shape)) in str(error.value)
+
+
+def test_the_json_beside_it_describes_it(loaded, tmp_path):
+    beside = json.loads((tmp_path / "policy.json").read_text())
+    assert beside["sha256"] == hashlib.sha256((tmp_path / "policy.npz").read_bytes()).hexdigest()
+    expected = {
+        "task": "Swimmer",
+        "observation_size": S,
+        "action_size": A,
+        "hidden": list(HIDDEN),
+        "activation": "tanh",
+        "iteration": 3,
+        "real_steps": 900,
+        "return_real": 12.5,
+        "format": 1,
+    }
+    assert expected.items() <= beside.items()
+    assert loaded.info.hidden == HIDDEN
+
+
+def test_the_file_itself_can_be_loaded(loaded, tmp_path):
+    np.testing.assert_array_equal(load_policy(tmp_path / "policy.npz")(np.ones(S)), loaded(np.ones(S)))
+
+
+def test_no_policy_says_how_to_get_one(tmp_path):
+    with pytest.raises(
+        RunDirectoryError, match=r"holds no policy: expected .*policy\.npz; train one with: metrpo train"
+    ):
+        load_policy(tmp_path)
+
+
+def test_a_damaged_policy_is_refused(loaded, tmp_path):
+    path = tmp_path / "policy.npz"
+    path.write_bytes(path.read_bytes()[:-1])
+    with pytest.raises(RunDirectoryError, match=r"policy\.npz is damaged"):
+        load_policy(tmp_path)
+
+
+def test_other_arrays_are_no_policy(tmp_path):
+    write_arrays(tmp_path / "policy.npz", {"x": np.zeros(2)}, {})
+    with pytest.raises(RunDirectoryError, match="is no policy: it lacks task, observation_size"):
+        load_policy(tmp_path)
+
+
+def test_deployment_needs_neither_jax_nor_mujoco(loaded, tmp_path):
+    code = (
+        "import sys, numpy, metrpo; metrpo.load_policy(sys.argv[1])(numpy.zeros(5)); "
+        "print([m for m in ('jax', 'mujoco', 'gymnasium', 'matplotlib') if m in sys.modules])"
+    )
+    ran = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True)
+    assert ran.stdout == "[]\n"

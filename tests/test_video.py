@@ -1,0 +1,125 @@
+"""Videos: frames of a real episode in a file that players open, or a message that says what to install."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from metrpo.run import video
+from metrpo.run.video import VideoError, gl_backend, has_encoder, record
+
+needs_encoder = pytest.mark.skipif(not has_encoder(), reason="no video encoder (extra `video`)")
+
+
+class Pictures:
+    """Five frames of an odd size."""
+
+    metadata = {"render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, render_mode: str) -> None:
+        assert render_mode == "rgb_array"
+        self.seen: list[np.ndarray] = []
+
+    def reset(self, seed):
+        self.step_number = seed
+        return np.zeros(3), {}
+
+    def step(self, action):
+        self.seen.append(action)
+        self.step_number += 1
+        return np.zeros(3), 0.0, False, len(self.seen) == 4, {}
+
+    def render(self):
+        picture = np.zeros((65, 97, 3), np.uint8)
+        picture[:, : 20 * len(self.seen)] = (250, 120, 10)
+        return picture
+
+    def close(self):
+        pass
+
+
+def zero(observation):
+    return np.zeros(2, np.float32)
+
+
+@needs_encoder
+def test_mp4_holds_every_frame_in_h264(tmp_path):
+    import imageio_ffmpeg
+
+    path = record(Pictures, zero, tmp_path / "new" / "v.mp4")
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    decoded = subprocess.run(command, capture_output=True, check=True)
+    frames = np.frombuffer(decoded.stdout, np.uint8).reshape(-1, 64, 96, 3)
+    assert len(frames) == 5
+    for part in (b"Video: h264", b"yuv420p", b"10 fps"):
+        assert part in decoded.stderr
+    assert frames[0].mean() < 10
+    assert abs(frames[-1][:, :70].reshape(-1, 3).mean(0) - (250, 120, 10)).max() < 25
+    assert [p.name for p in path.parent.iterdir()] == ["v.mp4"]
+
+
+def test_gif_needs_no_encoder(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with Image.open(record(Pictures, zero, tmp_path / "v.gif")) as picture:
+        assert (picture.n_frames, picture.size, picture.info["duration"]) == (5, (96, 64), 100)
+
+
+def test_no_encoder_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(VideoError, match=r"no video encoder: pip install 'metrpo\[video\]', or choose a \.gif"):
+        record(Pictures, zero, tmp_path / "v.mp4")
+
+
+def test_no_gl_says_what_to_install(tmp_path, monkeypatch):
+    def broken(self):
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(Pictures, "render", broken)
+    with pytest.raises(VideoError, match=r"cannot render here \(RuntimeError: no display\): apt install libosmesa6"):
+        record(Pictures, zero, tmp_path / "v.gif")
+    assert not any(tmp_path.iterdir())
+
+
+def test_other_suffixes_are_refused(tmp_path):
+    with pytest.raises(VideoError, match=r"ends in \.mp4 or \.gif"):
+        record(Pictures, zero, tmp_path / "v.avi")
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(VideoError, match=r"cannot write .*v\.gif"):
+        record(Pictures, zero, tmp_path / "file" / "v.gif")
+
+
+def test_the_first_backend_that_renders_is_named(monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(video, "_renders", lambda name: name == "egl")
+    assert gl_backend() == "egl"
+    monkeypatch.setattr(video, "_renders", lambda name: False)
+    assert gl_backend() is None
+
+
+_SWIM = """
+import sys
+from pathlib import Path
+import numpy as np
+from metrpo.run.video import record
+from metrpo.world.task import get_task
+task = get_task("Swimmer")
+def short(**kwargs):
+    env = task.make_env(**kwargs)
+    env._max_episode_steps = 3
+    return env
+record(short, lambda state: np.ones(task.action_size, np.float32), Path(sys.argv[1]))
+"""
+
+
+@pytest.mark.skipif(gl_backend() is None, reason="no OpenGL")
+def test_the_swimmer_is_seen(tmp_path):
+    path = tmp_path / "swim.gif"
+    subprocess.run([sys.executable, "-c", _SWIM, str(path)], check=True)
+    with Image.open(path) as picture:
+        assert picture.n_frames == 4
+        assert len(set(picture.convert("L").tobytes())) > 20
