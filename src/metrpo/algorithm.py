@@ -16,15 +16,15 @@ resumed at an iteration boundary is the same run.
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from metrpo.config import Config
@@ -35,6 +35,7 @@ from metrpo.model.imagine import ImagineInfo, imagine, returns_per_model
 from metrpo.policy import advantage, gaussian, trpo
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.validate import RULES
+from metrpo.run.directory import RunDirectory
 from metrpo.run.progress import SILENT, Progress
 from metrpo.types import Array
 from metrpo.world import collect as real
@@ -134,6 +135,46 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
     )
     collected = float(np.mean([e.rewards.sum() for e in episodes]))
     return state, _row(state, returns, collected, fitted, phase, clock)
+
+
+def train(config: Config, run_dir: str | Path | None = None, progress: Progress = SILENT) -> State:
+    """Runs the loop until the budget is spent and returns the last state.
+
+    With `run_dir`, every iteration is saved there; a run found there is resumed, exactly as if it had never stopped.
+
+    Raises `TaskError` for an unknown task and `RunDirectoryError` when `run_dir` cannot be used (see `RunDirectory`).
+    """
+    template = init(config)
+    if run_dir is None:
+        return _loop(config, template, progress, lambda state, row: row)
+    with RunDirectory(run_dir, config) as run:
+        return _loop(config, run.load(template) or template, progress, run.save)
+
+
+def _loop(config: Config, state: State, progress: Progress, save: Callable[[State, Row], Mapping[str, Any]]) -> State:
+    seconds: list[float] = []
+    try:
+        while not finished(config, state):
+            started = time.monotonic()
+            left = _iterations_left(config, state)
+            progress.begin(state.iteration + 1, None if left is None else state.iteration + left)
+            state, row = step(config, state, progress)
+            written = save(state, row)
+            # The first iteration compiles: the second is the better guess as soon as there is one.
+            seconds = [*seconds, time.monotonic() - started][-3:]
+            left = _iterations_left(config, state)
+            progress.end(written, None if left is None else left * float(np.mean(seconds)))
+    finally:
+        progress.close()
+    return state
+
+
+def _iterations_left(config: Config, state: State) -> int | None:
+    if config.real_steps is None:
+        return config.iterations - state.iteration
+    if not state.iteration:
+        return None
+    return math.ceil((config.real_steps - state.real_steps) / (state.real_steps / state.iteration))
 
 
 def finished(config: Config, state: State) -> bool:
@@ -306,13 +347,14 @@ class Clock:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
+        """Counts what happens inside the block towards `stage`."""
         start, counted = time.perf_counter(), sum(self.seconds.values())
         yield
         inner = sum(self.seconds.values()) - counted
         self.seconds[stage] += time.perf_counter() - start - inner
 
     def row(self) -> Row:
-        """Metrics columns."""
+        """The metrics' columns."""
         return {f"seconds_{stage}": seconds for stage, seconds in self.seconds.items()}
 
 

@@ -31,7 +31,7 @@ class CollectConfig:
     max_std: float = 3.0
     """Exploration noise: the standard deviation is drawn from U[0, max_std]."""
     std_per: Literal["episode", "step"] = "episode"
-    """How often that standard deviation is drawn: once an episode (the paper) or at every step (its authors' code)."""
+    """How often that standard deviation is drawn: once an episode (the paper) or at every step (authors' code)."""
     parameter_noise: float = 3.0
     """Scale of the parameter noise: std = scale * |policy - previous policy|, redrawn every episode; 0 switches it off."""
     validation_fraction: float = 1 / 3
@@ -80,8 +80,12 @@ class FitConfig:
 
     learning_rate: float = 1e-3
     """Adam's step size."""
+    weight_decay: float = 0.0
+    """Decoupled weight decay (AdamW): each step shrinks the weights, not the biases, by learning_rate * weight_decay."""
     batch_size: int = 1000
     """Transitions per minibatch, drawn with replacement and for each model independently."""
+    loss_units: Literal["raw", "std"] = "raw"
+    """Units of the squared error, summed over state dimensions: raw state units (the paper), or each one's std."""
     validate_every: int = 5
     """Passes over the training set between two validations."""
     patience: int = 25
@@ -93,6 +97,7 @@ class FitConfig:
 
     def __post_init__(self) -> None:
         _require(_positive(self.learning_rate), "fit.learning_rate", self.learning_rate, "a finite number > 0")
+        _require(_nonnegative(self.weight_decay), "fit.weight_decay", self.weight_decay, "a finite number >= 0")
         for name in ("batch_size", "validate_every", "patience", "max_passes"):
             _require(getattr(self, name) >= 1, f"fit.{name}", getattr(self, name), "at least 1")
         _require(self.reinitialise_every >= 0, "fit.reinitialise_every", self.reinitialise_every, "at least 0")

@@ -32,8 +32,13 @@ PAPER: dict[str, Overrides] = {
 }
 
 FAST_ALL: Overrides = {
-    "ensemble.hidden": (256, 256),
-    "imagine.steps": 20_000,
+    "ensemble.hidden": (200, 200),
+    "ensemble.std_floor": 1e-4,
+    "fit.batch_size": 250,
+    "fit.loss_units": "std",
+    "fit.patience": 10,
+    "fit.reinitialise_every": 0,
+    "imagine.steps": 30_000,
     "validate.starts": 50,
 }
 

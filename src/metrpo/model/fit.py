@@ -27,7 +27,7 @@ class FitInfo(NamedTuple):
     passes: int
     """Passes over the training set."""
     validation_loss: Array
-    """[K], each member's best, in squared raw state units."""
+    """[K], each member's best, in squared `loss_units`."""
     train_loss: Array
     """[K], of the last minibatches."""
     best_pass: Array
@@ -57,8 +57,8 @@ def fit(
     Stops when no member has improved for `config.patience` passes, at the latest after `config.max_passes`.
     `on_validation(passes, best losses [K])` is called at every validation. Adam starts afresh.
     """
-    optimizer = optax.adam(config.learning_rate)
-    loss = validation_loss(Ensemble(networks, normaliser), validation)
+    optimizer = _optimizer(config)
+    loss = validation_loss(Ensemble(networks, normaliser), validation, config.loss_units)
     at = _Progress(networks, optimizer.init(networks), networks, loss, jnp.zeros(loss.shape, jnp.int32), loss)
     at = jax.tree.map(jnp.copy, at)  # its buffers are given away below, the caller's are not
     # At least one step a pass: the first iterations of a small task may have fewer transitions than a minibatch.
@@ -72,13 +72,19 @@ def fit(
     return Ensemble(at.best_networks, normaliser), info
 
 
-def loss_of(ensemble: Ensemble, states: Array, actions: Array, deltas: Array) -> Array:
-    """[K, B]: squared error of the predicted change, summed over state dimensions, raw units (paper, eq. 1)."""
-    return jnp.sum(jnp.square(predict_delta(ensemble, states, actions) - deltas), axis=-1)
+def loss_of(ensemble: Ensemble, loss_units: str, states: Array, actions: Array, deltas: Array) -> Array:
+    """[K, B]: squared error of the predicted change, summed over state dimensions (paper, eq. 1).
+
+    In "raw" state units (the paper), or each dimension in units of its "std", so that none drowns another.
+    """
+    errors = predict_delta(ensemble, states, actions) - deltas
+    if loss_units == "std":
+        errors = errors / ensemble.normaliser.delta_std
+    return jnp.sum(jnp.square(errors), axis=-1)
 
 
-@jax.jit
-def validation_loss(ensemble: Ensemble, validation: Transitions) -> Array:
+@partial(jax.jit, static_argnames="loss_units")
+def validation_loss(ensemble: Ensemble, validation: Transitions, loss_units: str = "raw") -> Array:
     """[K]: mean of `loss_of` over the first `size` validation transitions; the capacity beyond costs nothing."""
     members = ensemble.members
     capacity = validation.states.shape[0]
@@ -86,7 +92,7 @@ def validation_loss(ensemble: Ensemble, validation: Transitions) -> Array:
     def chunk_sum(i: Array, total: Array) -> Array:
         index = i * VALIDATION_CHUNK + jnp.arange(VALIDATION_CHUNK)
         rows = [jnp.take(x, index, axis=0, mode="clip") for x in validation[:3]]
-        losses = loss_of(ensemble, *(jnp.broadcast_to(x, (members, *x.shape)) for x in rows))
+        losses = loss_of(ensemble, loss_units, *(jnp.broadcast_to(x, (members, *x.shape)) for x in rows))
         return total + jnp.sum(jnp.where(index < jnp.minimum(validation.size, capacity), losses, 0.0), axis=-1)
 
     chunks = (validation.size + VALIDATION_CHUNK - 1) // VALIDATION_CHUNK
@@ -104,12 +110,12 @@ def _train_and_validate(
     steps: Array,
     passes: Array,
 ) -> _Progress:
-    optimizer = optax.adam(config.learning_rate)
+    optimizer = _optimizer(config)
     members = at.best_loss.shape[0]
     block_key = jax.random.fold_in(key, passes)
 
     def total_loss(networks: Networks, *batch: Array) -> tuple[Array, Array]:
-        losses = jnp.mean(loss_of(Ensemble(networks, normaliser), *batch), axis=-1)
+        losses = jnp.mean(loss_of(Ensemble(networks, normaliser), config.loss_units, *batch), axis=-1)
         return jnp.sum(losses), losses
 
     def step(i: Array, carry: tuple[Networks, optax.OptState, Array]) -> tuple[Networks, optax.OptState, Array]:
@@ -122,7 +128,7 @@ def _train_and_validate(
 
     start = (at.networks, at.optimizer, at.train_loss)
     networks, optimizer_state, train_loss = jax.lax.fori_loop(0, steps, step, start)
-    loss = validation_loss(Ensemble(networks, normaliser), validation)
+    loss = validation_loss(Ensemble(networks, normaliser), validation, config.loss_units)
     better = loss < at.best_loss  # False for NaN: a diverged member keeps its best weights
 
     def keep_best(new: Array, best: Array) -> Array:
@@ -136,6 +142,14 @@ def _train_and_validate(
         jnp.where(better, passes, at.best_pass),
         train_loss,
     )
+
+
+def _optimizer(config: FitConfig) -> optax.GradientTransformation:
+    return optax.adamw(config.learning_rate, weight_decay=config.weight_decay, mask=_weights_only)
+
+
+def _weights_only(networks: Networks) -> tuple[tuple[bool, bool], ...]:
+    return tuple((True, False) for _ in networks)
 
 
 def minibatch(key: Array, members: int, batch_size: int, size: Array) -> Array:

@@ -9,7 +9,7 @@ from metrpo.types import Array, Trajectories
 
 
 def features(states: Array) -> Array:
-    """The baseline's features [o, o^2, t/100, (t/100)^2, (t/100)^3, 1], o clipped to +-10: [T, N, S] -> [T, N, 2S + 4]."""
+    """The baseline's features [o, o^2, t/100, (t/100)^2, (t/100)^3, 1], |o| <= 10: [T, N, S] -> [T, N, 2S + 4]."""
     observed = jnp.clip(states, -10.0, 10.0)
     steps, count, _ = states.shape
     t = jnp.broadcast_to((jnp.arange(steps, dtype=states.dtype) / 100.0)[:, None, None], (steps, count, 1))

@@ -1,4 +1,4 @@
-"""Trust-region policy optimization (Schulman et al. 2015): natural gradient by conjugate gradients, then a line search."""
+"""Trust-region policy optimization (Schulman et al. 2015): natural gradient by conjugate gradients, line search."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class ImproveInfo(NamedTuple):
 
 
 def improve(policy: Policy, batch: Batch, config: TRPOConfig) -> tuple[Policy, ImproveInfo]:
-    """One TRPO update on `batch`; the policy unchanged when the line search finds no step that improves within max_kl."""
+    """One TRPO update on `batch`; the policy stays as it is when no step of the line search improves within max_kl."""
     count = jnp.maximum(jnp.sum(batch.mask), 1.0)
     old_means = gaussian.mean(policy, batch.states)
     old_log_probability = gaussian.log_probability(old_means, policy.log_std, batch.actions)
