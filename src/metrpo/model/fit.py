@@ -123,7 +123,7 @@ def _train_and_validate(
         index = minibatch(jax.random.fold_in(block_key, i), members, config.batch_size, train.size)
         batch = (jnp.take(x, index, axis=0) for x in train[:3])
         gradient, losses = jax.grad(total_loss, has_aux=True)(networks, *batch)
-        change, optimizer_state = optimizer.update(gradient, optimizer_state)
+        change, optimizer_state = optimizer.update(gradient, optimizer_state, networks)
         return optax.apply_updates(networks, change), optimizer_state, losses
 
     start = (at.networks, at.optimizer, at.train_loss)
