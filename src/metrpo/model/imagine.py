@@ -121,8 +121,10 @@ def returns_per_model(
         states, alive, total = carry
         actions = jnp.clip(act(states), -1.0, 1.0)
         following = predict(ensemble, states, actions)
-        total = total + alive * reward(states, actions, following)
-        total = jnp.where(jnp.all(jnp.abs(following) < EXPLODED, axis=-1) | (alive == 0), total, jnp.nan)
+        rewards = reward(states, actions, following)
+        sound = jnp.all(jnp.abs(following) < EXPLODED, axis=-1) & jnp.isfinite(rewards)
+        # A product with `alive` would let what follows the end through: 0 * inf is NaN.
+        total = total + jnp.where(alive > 0, jnp.where(sound, rewards, jnp.nan), 0.0)
         if terminated is not None:
             alive = alive * (1.0 - terminated(following))
         return (following, alive, total), None
