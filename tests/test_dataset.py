@@ -1,0 +1,144 @@
+"""The dataset: whole episodes, 2:1, oldest out first."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from helpers import random_episode, random_transitions
+from metrpo.config import CollectConfig
+from metrpo.types import Episode
+from metrpo.world import dataset as datasets
+
+CONFIG = CollectConfig()
+
+
+def numbered_episodes(lengths, first=0):
+    """Episodes whose every state begins with [episode, step], and whose actions hold the same."""
+    episodes = []
+    for number, length in enumerate(lengths, first):
+        steps = np.arange(length + 1)
+        states = np.stack([np.full(length + 1, number), steps, 0.5 * steps**2], axis=1).astype(np.float32)
+        actions = states[:-1, :2]
+        episodes.append(Episode(states, actions, np.zeros(length, np.float32), False))
+    return episodes
+
+
+def split_of(dataset):
+    """The episodes in either set, as {number: steps in order}."""
+    out = []
+    for t in (dataset.train, dataset.validation):
+        numbers = t.states[:, 0].astype(int)
+        out.append({n: t.states[numbers == n, 1].astype(int).tolist() for n in dict.fromkeys(numbers.tolist())})
+    return out
+
+
+@given(st.lists(st.integers(1, 6), min_size=2, max_size=30), st.integers(0, 2**31 - 1), st.floats(0.05, 0.95))
+@settings(max_examples=60, deadline=None)
+def test_whole_episodes_are_split_by_the_share(lengths, seed, fraction):
+    config = CollectConfig(validation_fraction=fraction)
+    rng = np.random.default_rng(seed)
+    dataset = datasets.add(datasets.empty(3, 2), numbered_episodes(lengths), config, rng)
+    train, validation = split_of(dataset)
+    assert not train.keys() & validation.keys()
+    for number, steps in (train | validation).items():
+        assert steps == list(range(lengths[number]))
+    assert len(train) + len(validation) == len(lengths)
+    assert len(train) >= 1
+    assert len(validation) >= 1
+    assert abs(len(validation) - fraction * len(lengths)) <= 1
+    assert dataset.train.size == len(dataset.train.states) == sum(lengths[n] for n in train)
+    assert dataset.validation.size == sum(lengths[n] for n in validation)
+
+
+def test_the_default_split_is_two_to_one():
+    dataset = datasets.add(datasets.empty(3, 2), numbered_episodes([10] * 15), CONFIG, np.random.default_rng(0))
+    assert (dataset.train.size, dataset.validation.size) == (100, 50)
+
+
+def test_which_episodes_are_held_out_is_drawn():
+    drawn = set()
+    for seed in range(30):
+        dataset = datasets.add(datasets.empty(3, 2), numbered_episodes([2] * 6), CONFIG, np.random.default_rng(seed))
+        drawn |= split_of(dataset)[1].keys()
+    assert drawn == set(range(6))
+
+
+def test_deltas_are_exact_differences_and_rows_belong_together():
+    rng = np.random.default_rng(0)
+    episodes = [random_episode(rng, n) for n in (3, 5, 4)]
+    # A far position that moves a little: what is stored is the difference of the stored states, to the last bit.
+    episodes.append(episodes[0]._replace(states=(1000 + 0.001 * episodes[0].states).astype(np.float32)))
+    dataset = datasets.add(datasets.empty(4, 2), episodes, CONFIG, np.random.default_rng(1))
+    rows = {}
+    for e in episodes:
+        for s, a, s2 in zip(e.states[:-1], e.actions, e.states[1:], strict=True):
+            rows[s.tobytes()] = (a, s2.astype(np.float64) - s.astype(np.float64))
+    for t in (dataset.train, dataset.validation):
+        for s, a, delta in zip(t.states, t.actions, t.deltas, strict=True):
+            np.testing.assert_array_equal(a, rows[s.tobytes()][0])
+            np.testing.assert_array_equal(delta, rows[s.tobytes()][1].astype(np.float32))
+        assert {x.dtype for x in t[:3]} == {np.dtype(np.float32)}
+
+
+def test_no_transition_leads_from_one_episode_into_the_next():
+    dataset = datasets.add(datasets.empty(3, 2), numbered_episodes([4, 3, 5]), CONFIG, np.random.default_rng(0))
+    for t in (dataset.train, dataset.validation):
+        assert np.all(t.deltas[:, 0] == 0), "the number of the episode never changes"
+        assert np.all(t.deltas[:, 1] == 1), "the step always advances by one"
+
+
+def test_the_oldest_go_first():
+    config = CollectConfig(max_train=25, max_validation=12)
+    dataset, rng = datasets.empty(3, 2), np.random.default_rng(0)
+    history = [[], []]
+    for round_ in range(4):
+        before = [set(s) for s in split_of(dataset)]
+        dataset = datasets.add(dataset, numbered_episodes([5] * 3, first=3 * round_), config, rng)
+        for i, (now, old) in enumerate(zip(split_of(dataset), before, strict=True)):
+            history[i] += [(n, s) for n in now if n not in old for s in range(5)]
+        assert dataset.train.size == min(10 * (round_ + 1), 25)
+        assert dataset.validation.size == min(5 * (round_ + 1), 12)
+    for t, rows in zip((dataset.train, dataset.validation), history, strict=True):
+        assert [tuple(r) for r in t.states[:, :2].astype(int).tolist()] == rows[-t.size :]
+        np.testing.assert_array_equal(t.actions, t.states[:, :2])
+        np.testing.assert_array_equal(t.deltas[:, 2], t.states[:, 1] + 0.5)
+
+
+def test_all_first_states_are_kept_as_starts_in_order():
+    dataset, rng = datasets.empty(3, 2), np.random.default_rng(0)
+    for first in (0, 4):
+        dataset = datasets.add(dataset, numbered_episodes([3, 2, 2, 1], first), CollectConfig(max_train=1), rng)
+    np.testing.assert_array_equal(dataset.starts, [[n, 0, 0] for n in range(8)])
+
+
+def test_a_single_first_episode_serves_for_both_and_a_single_later_one_trains():
+    rng = np.random.default_rng(0)
+    dataset = datasets.add(datasets.empty(3, 2), numbered_episodes([4]), CONFIG, rng)
+    assert split_of(dataset) == [{0: [0, 1, 2, 3]}, {0: [0, 1, 2, 3]}]
+    dataset = datasets.add(dataset, numbered_episodes([2], first=1), CONFIG, rng)
+    assert split_of(dataset) == [{0: [0, 1, 2, 3], 1: [0, 1]}, {0: [0, 1, 2, 3]}]
+
+
+def test_add_leaves_the_old_dataset_alone():
+    rng = np.random.default_rng(0)
+    old = datasets.add(datasets.empty(3, 2), numbered_episodes([4, 4, 4]), CONFIG, rng)
+    copies = [np.copy(x) for x in (*old.train, *old.validation, old.starts)]
+    datasets.add(old, numbered_episodes([4, 4, 4], first=3), CONFIG, rng)
+    for now, before in zip((*old.train, *old.validation, old.starts), copies, strict=True):
+        np.testing.assert_array_equal(now, before)
+
+
+@pytest.mark.parametrize("size", [0, 1, 7, 10])
+def test_capacity_pads_with_rows_that_the_size_excludes(size):
+    small = random_transitions(np.random.default_rng(0), 10)._replace(size=size)
+    small = small._replace(**{name: getattr(small, name)[:size] for name in ("states", "actions", "deltas")})
+    padded = datasets.with_capacity(small, 10)
+    assert int(padded.size) == size
+    for now, before in zip(padded[:3], small[:3], strict=True):
+        assert now.shape == (10, before.shape[1])
+        assert now.dtype == np.float32
+        np.testing.assert_array_equal(now[:size], before)
+        assert not np.any(now[size:])

@@ -1,0 +1,112 @@
+"""The ensemble's networks and normaliser against slow NumPy versions."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+import pytest
+
+from helpers import (
+    linear_ensemble,
+    member,
+    random_ensemble,
+    random_normaliser,
+    random_transitions,
+    slow_delta,
+)
+from metrpo.model import ensemble as ensembles
+from metrpo.types import Transitions
+
+
+@pytest.mark.parametrize("hidden", [(), (8,), (8, 6)])
+def test_prediction_is_each_members_own_relu_network(hidden):
+    rng = np.random.default_rng(0)
+    ensemble = random_ensemble(1, members=3, hidden=hidden)
+    states, actions = rng.normal(size=(3, 5, 4)).astype(np.float32), rng.normal(size=(3, 5, 2)).astype(np.float32)
+    delta = ensembles.predict_delta(ensemble, states, actions)
+    expected = [[slow_delta(ensemble, k, states[k, b], actions[k, b]) for b in range(5)] for k in range(3)]
+    np.testing.assert_allclose(delta, expected, atol=1e-5)
+    np.testing.assert_allclose(ensembles.predict(ensemble, states, actions), states + expected, atol=1e-5)
+    assert ensemble.members == 3
+
+
+@pytest.mark.parametrize("relu", [False, True])
+def test_a_linear_system_can_be_written_as_an_ensemble(relu):
+    """Whatever the normaliser: the tests of imagination stand on this."""
+    rng = np.random.default_rng(2)
+    matrices = [(rng.normal(size=(4, 4)), rng.normal(size=(4, 2))) for _ in range(2)]
+    ensemble = linear_ensemble(matrices, random_normaliser(rng, 4, 2), relu)
+    states, actions = rng.normal(size=(2, 6, 4)).astype(np.float32), rng.normal(size=(2, 6, 2)).astype(np.float32)
+    expected = [s @ a.T + u @ b.T for (a, b), s, u in zip(matrices, states, actions, strict=True)]
+    np.testing.assert_allclose(ensembles.predict(ensemble, states, actions), expected, atol=1e-4)
+
+
+def test_a_member_alone_predicts_as_in_the_ensemble():
+    rng = np.random.default_rng(3)
+    ensemble = random_ensemble(4)
+    states, actions = rng.normal(size=(3, 5, 4)).astype(np.float32), rng.normal(size=(3, 5, 2)).astype(np.float32)
+    together = ensembles.predict(ensemble, states, actions)
+    for k in range(3):
+        alone = ensembles.predict(member(ensemble, k), states[k : k + 1], actions[k : k + 1])
+        np.testing.assert_allclose(alone[0], together[k], atol=1e-6)
+
+
+def test_fresh_members_are_xavier_uniform_and_differ():
+    networks = ensembles.init(jax.random.key(0), 4, 30, 10, (50,))
+    assert [(w.shape, b.shape) for w, b in networks] == [((4, 40, 50), (4, 1, 50)), ((4, 50, 30), (4, 1, 30))]
+    for weights, biases in networks:
+        bound = np.sqrt(6 / (weights.shape[1] + weights.shape[2]))
+        assert not np.any(biases)
+        assert 0.98 * bound < np.abs(weights).max() <= bound
+        assert np.std(weights) == pytest.approx(bound / np.sqrt(3), rel=0.05)
+        correlations = np.corrcoef(np.asarray(weights).reshape(4, -1))
+        assert np.abs(correlations[~np.eye(4, dtype=bool)]).max() < 0.1
+
+
+def test_a_member_does_not_depend_on_how_many_there_are():
+    five = ensembles.init(jax.random.key(7), 5, 3, 2, (6,))
+    two = ensembles.init(jax.random.key(7), 2, 3, 2, (6,))
+    assert jax.tree.all(jax.tree.map(lambda a, b: np.array_equal(a[:2], b), five, two))
+
+
+def test_normaliser_is_the_mean_and_std_of_the_rows():
+    rng = np.random.default_rng(5)
+    scales = np.array([0.5, 2.0, 30.0, 4.0])
+    train = Transitions(
+        (rng.normal(size=(500, 4)) * scales + 100).astype(np.float32),
+        rng.uniform(-1, 1, size=(500, 2)).astype(np.float32),
+        (rng.normal(size=(500, 4)) * scales - 3).astype(np.float32),
+        500,
+    )
+    n = ensembles.normaliser_of(train, 0.1)
+    np.testing.assert_allclose(n.state_mean, train.states.mean(0, dtype=np.float64), rtol=1e-5)
+    np.testing.assert_allclose(n.action_mean, train.actions.mean(0, dtype=np.float64), atol=1e-6)
+    np.testing.assert_allclose(n.delta_mean, train.deltas.mean(0, dtype=np.float64), rtol=1e-5)
+    np.testing.assert_allclose(n.state_scale, 1 / train.states.std(0, dtype=np.float64), rtol=1e-4)
+    np.testing.assert_allclose(n.action_scale, 1 / train.actions.std(0, dtype=np.float64), rtol=1e-4)
+    np.testing.assert_allclose(n.delta_std, train.deltas.std(0, dtype=np.float64), rtol=1e-4)
+
+
+def test_normaliser_never_divides_by_less_than_the_floor():
+    rng = np.random.default_rng(6)
+    x = (rng.normal(size=(400, 3)) * [0.0, 0.01, 1.0]).astype(np.float32)
+    n = ensembles.normaliser_of(Transitions(x, x[:, :2], x, 400), 0.25)
+    np.testing.assert_allclose(1 / n.state_scale, [0.25, 0.25, x[:, 2].std()], rtol=1e-4)
+    np.testing.assert_allclose(1 / n.action_scale, 0.25, rtol=1e-6)
+    np.testing.assert_allclose(n.delta_std, [0.25, 0.25, x[:, 2].std()], rtol=1e-4)
+
+
+def test_unseen_dimensions_have_no_influence_and_are_predicted_all_the_same():
+    rng = np.random.default_rng(8)
+    train = random_transitions(rng, 50)
+    normaliser = ensembles.normaliser_of(train, 0.1, unseen=(0, 2))
+    ensemble = random_ensemble(9)._replace(normaliser=normaliser)
+    states, actions = rng.normal(size=(3, 5, 4)).astype(np.float32), rng.normal(size=(3, 5, 2)).astype(np.float32)
+    moved = states + np.array([1000.0, 0.0, -50.0, 0.0], np.float32)
+    deltas = np.asarray(ensembles.predict_delta(ensemble, states, actions))
+    np.testing.assert_array_equal(ensembles.predict_delta(ensemble, moved, actions), deltas)
+    assert np.all(np.ptp(deltas, axis=1) > 1e-3), "every dimension, unseen ones too, is predicted from the others"
+    seen = states + np.array([0.0, 1.0, 0.0, 0.0], np.float32)
+    assert not np.allclose(ensembles.predict_delta(ensemble, seen, actions), deltas)
+    # What normalises the prediction of an unseen dimension is its own spread.
+    np.testing.assert_allclose(normaliser.delta_std, train.deltas.std(0), rtol=1e-4)

@@ -1,0 +1,246 @@
+"""TRPO against dense linear algebra, and its promises on any batch."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from jax.flatten_util import ravel_pytree
+
+from helpers import random_policy, slow_mean
+from metrpo.config import TRPOConfig
+from metrpo.policy import gaussian, trpo
+
+COUNT, STATE, ACTION = 24, 4, 2
+CONFIG = TRPOConfig()
+improve = jax.jit(trpo.improve, static_argnames="config")
+
+
+def a_batch(seed, policy, share=0.7):
+    rng = np.random.default_rng(seed)
+    states = rng.normal(size=(COUNT, STATE)).astype(np.float32)
+    means = np.array([slow_mean(policy, s) for s in states])
+    actions = (means + np.exp(policy.log_std) * rng.normal(size=means.shape)).astype(np.float32)
+    mask = (rng.uniform(size=COUNT) < share).astype(np.float32)
+    return trpo.Batch(states, actions, mask * rng.normal(size=COUNT).astype(np.float32), mask)
+
+
+def slow_surrogate_and_kl(old, new, batch):
+    """Both, in float64 NumPy, over the steps that count."""
+    chosen = batch.mask > 0
+    if not chosen.any():
+        return 0.0, 0.0
+    s0, s1 = (np.exp(np.asarray(p.log_std, np.float64)) for p in (old, new))
+    gains, divergences = [], []
+    for state, action, advantage in zip(*(x[chosen] for x in batch[:3]), strict=True):
+        m0, m1 = slow_mean(old, state), slow_mean(new, state)
+        log_ratio = np.sum(((action - m0) / s0) ** 2 / 2 - ((action - m1) / s1) ** 2 / 2 + np.log(s0) - np.log(s1))
+        gains.append(np.exp(log_ratio) * advantage)
+        divergences.append(np.sum(np.log(s1 / s0) + (s0**2 + (m0 - m1) ** 2) / (2 * s1**2) - 0.5))
+    return np.mean(gains), np.mean(divergences)
+
+
+def dense_fisher(policy, states, mask):
+    """The Hessian of the mean KL at the policy itself, by JAX's second derivatives: independent of Gauss-Newton."""
+    flat, unravel = ravel_pytree(policy)
+    old_means = gaussian.mean(policy, jnp.asarray(states))
+
+    def mean_kl(parameters):
+        new = unravel(parameters)
+        divergence = gaussian.kl(old_means, policy.log_std, gaussian.mean(new, jnp.asarray(states)), new.log_std)
+        return jnp.sum(mask * divergence) / jnp.sum(mask)
+
+    return np.asarray(jax.jit(jax.hessian(mean_kl))(flat), np.float64)
+
+
+@pytest.mark.parametrize(("hidden", "damping"), [((), 0.0), ((5,), 0.1), ((5, 3), 1e-5)])
+def test_fisher_product_is_the_hessian_of_the_mean_kl(hidden, damping):
+    policy = random_policy(1, hidden=hidden)
+    batch = a_batch(2, policy)
+    assert 0 < batch.mask.sum() < COUNT
+    flat, unravel = ravel_pytree(policy)
+    product = trpo.fisher_product(policy, jnp.asarray(batch.states), batch.mask, damping)
+    eye = jnp.eye(flat.size)
+    matrix = jax.jit(jax.vmap(lambda v: ravel_pytree(product(unravel(v)))[0]))(eye)
+    expected = dense_fisher(policy, batch.states, batch.mask) + damping * np.eye(flat.size)
+    np.testing.assert_allclose(matrix, expected, atol=2e-5 * np.abs(expected).max())
+
+
+def a_system(seed, size, spread):
+    rng = np.random.default_rng(seed)
+    q, _ = np.linalg.qr(rng.normal(size=(size, size)))
+    return (q * np.geomspace(1, spread, size)) @ q.T, rng.normal(size=size)
+
+
+@pytest.mark.parametrize(("size", "spread"), [(1, 1.0), (5, 10.0), (12, 100.0)])
+def test_conjugate_gradient_solves(size, spread):
+    matrix, target = a_system(size, size, spread)
+    x, residual = trpo.conjugate_gradient(lambda v: jnp.asarray(matrix, jnp.float32) @ v, jnp.float32(target), 2 * size)
+    np.testing.assert_allclose(x, np.linalg.solve(matrix, target), atol=1e-3)
+    np.testing.assert_allclose(residual, 0, atol=1e-3)
+
+
+@pytest.mark.parametrize("iterations", [1, 3, 8])
+def test_an_unfinished_conjugate_gradient_knows_its_residual_and_curvature(iterations):
+    matrix, target = a_system(3, 20, 1000.0)
+    x, residual = trpo.conjugate_gradient(
+        lambda v: jnp.asarray(matrix, jnp.float32) @ v, jnp.float32(target), iterations
+    )
+    x, residual = np.asarray(x, np.float64), np.asarray(residual, np.float64)
+    np.testing.assert_allclose(residual, target - matrix @ x, atol=1e-3)
+    assert np.linalg.norm(residual) > 0.01, "the case must be an unfinished one"
+    assert x @ (target - residual) == pytest.approx(x @ matrix @ x, rel=1e-3)
+
+
+def test_conjugate_gradient_one_step_is_steepest_descent():
+    matrix, target = a_system(4, 6, 50.0)
+    x, _ = trpo.conjugate_gradient(lambda v: jnp.asarray(matrix, jnp.float32) @ v, jnp.float32(target), 1)
+    np.testing.assert_allclose(x, target * (target @ target) / (target @ matrix @ target), rtol=1e-4)
+
+
+def test_conjugate_gradient_stays_put_once_solved():
+    x, residual = trpo.conjugate_gradient(lambda v: 2 * v, jnp.ones(3), 50)
+    np.testing.assert_array_equal(x, 0.5)
+    np.testing.assert_array_equal(residual, 0)
+    x, _ = trpo.conjugate_gradient(lambda v: 2 * v, jnp.zeros(3), 5)
+    np.testing.assert_array_equal(x, 0)
+
+
+def test_the_step_is_the_natural_gradient_of_length_max_kl():
+    """Against a dense solve: direction F^-1 g, length sqrt(2 max_kl / x'Fx), shortened by the line search alone."""
+    policy = random_policy(11, hidden=(3,))
+    batch = a_batch(12, policy)
+    config = TRPOConfig(max_kl=1e-3, cg_iterations=60, damping=0.05)
+    new, info = improve(policy, batch, config)
+    flat, unravel = ravel_pytree(policy)
+
+    def surrogate(parameters):
+        p = unravel(parameters)
+        log_probability = gaussian.log_probability(
+            gaussian.mean(p, jnp.asarray(batch.states)), p.log_std, batch.actions
+        )
+        weights = batch.mask * batch.advantages / batch.mask.sum()
+        return jnp.sum(weights * jnp.exp(log_probability - jax.lax.stop_gradient(log_probability)))
+
+    gradient = np.asarray(jax.jit(jax.grad(surrogate))(flat), np.float64)
+    fisher = dense_fisher(policy, batch.states, batch.mask) + 0.05 * np.eye(flat.size)
+    x = np.linalg.solve(fisher, gradient)
+    full = x * np.sqrt(2 * config.max_kl / (x @ fisher @ x))
+    step = np.asarray(ravel_pytree(new)[0], np.float64) - np.asarray(flat, np.float64)
+    assert info.accepted
+    assert info.cg_residual < 1e-3
+    np.testing.assert_allclose(step, full * 0.8 ** int(info.backtracks), atol=2e-3 * np.abs(full).max())
+
+
+def test_a_gaussian_bandit_moves_as_the_closed_form_says():
+    """No state, one action, std 1: F is 1 for the mean, g the mean of z A; the first try lands on KL = max_kl."""
+    policy = gaussian.Policy(((np.zeros((1, 1), np.float32), np.zeros(1, np.float32)),), np.zeros(1, np.float32))
+    actions = np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32)
+    batch = trpo.Batch(np.zeros((4, 1), np.float32), actions, actions[:, 0], np.ones(4, np.float32))
+    new, info = improve(policy, batch, TRPOConfig(max_kl=0.02, damping=0.0, max_backtracks=2))
+    # z^2 - 1 = 0 for every action: the gradient of log_std vanishes, and the mean goes up by sqrt(2 max_kl).
+    tries = int(info.backtracks)
+    assert info.accepted
+    assert tries <= 1, "float32 may put the full step a hair beyond max_kl"
+    assert float(new.layers[0][1][0]) == pytest.approx(0.2 * 0.8**tries, rel=1e-4)
+    assert float(new.log_std[0]) == pytest.approx(0, abs=1e-6)
+    assert float(info.kl) == pytest.approx(0.02 * 0.64**tries, rel=1e-4)
+
+
+@given(
+    seed=st.integers(0, 2**31 - 1),
+    scale=st.sampled_from([0.1, 1.0, 4.0]),
+    std=st.sampled_from([0.02, 0.7, 5.0]),
+    size=st.sampled_from([1e-3, 1.0, 1e3]),
+    share=st.sampled_from([0.1, 0.7, 1.0]),
+    config=st.sampled_from([CONFIG, TRPOConfig(max_kl=1e-4, cg_iterations=3), TRPOConfig(max_kl=0.5, damping=0.01)]),
+)
+@settings(max_examples=120, deadline=None)
+def test_an_accepted_step_improves_within_the_trust_region(seed, scale, std, size, share, config):
+    policy = random_policy(seed, hidden=(5,), scale=scale, std=std)
+    batch = a_batch(seed + 1, policy, share)
+    batch = batch._replace(advantages=(size * batch.advantages).astype(np.float32))
+    new, info = improve(policy, batch, config)
+    if not info.accepted:
+        assert jax.tree.all(jax.tree.map(np.array_equal, new, policy))
+        assert (info.kl, info.improvement) == (0, 0)
+        return
+    before, _ = slow_surrogate_and_kl(policy, policy, batch)
+    after, divergence = slow_surrogate_and_kl(policy, new, batch)
+    spread = float(np.abs(batch.advantages).max())
+    assert divergence <= config.max_kl * 1.01 + 1e-6
+    assert divergence == pytest.approx(float(info.kl), rel=0.02, abs=2e-5)
+    assert after - before > -1e-4 * spread
+    assert after - before == pytest.approx(float(info.improvement), rel=0.02, abs=2e-4 * spread)
+    assert 0 <= info.backtracks < config.max_backtracks
+
+
+def test_most_steps_on_plain_batches_are_accepted():
+    """Else the property above would hold for an optimiser that never moves."""
+    infos = []
+    for seed in range(20):
+        policy = random_policy(seed, hidden=(5,))
+        infos.append(improve(policy, a_batch(seed, policy, 1.0), CONFIG)[1])
+    assert sum(bool(i.accepted) for i in infos) >= 18
+    assert np.mean([float(i.kl) for i in infos if i.accepted]) > 0.4 * CONFIG.max_kl
+
+
+def test_the_line_search_gives_up_after_its_tries():
+    """With so wide a trust region the quadratic model is far off, so that the full step fails and shorter ones pass."""
+    policy = random_policy(0, hidden=(5,))
+    batch = a_batch(1, policy)
+    one_try = TRPOConfig(max_kl=50.0, max_backtracks=1)
+    new, info = improve(policy, batch, one_try)
+    assert not info.accepted
+    assert info.backtracks == 0
+    assert jax.tree.all(jax.tree.map(np.array_equal, new, policy))
+    many, info = improve(policy, batch, TRPOConfig(max_kl=50.0, max_backtracks=60))
+    assert info.accepted
+    assert 0 < info.backtracks < 60
+    assert not np.array_equal(many.log_std, policy.log_std)
+
+
+@pytest.mark.parametrize("poison", ["advantages", "actions", "states"])
+def test_nan_leaves_the_policy_as_it_is(poison):
+    policy = random_policy(0, hidden=(5,))
+    batch = a_batch(1, policy, 1.0)
+    getattr(batch, poison)[3] = np.nan
+    new, info = improve(policy, batch, CONFIG)
+    assert not info.accepted
+    assert jax.tree.all(jax.tree.map(np.array_equal, new, policy))
+    assert (info.kl, info.improvement) == (0, 0)
+
+
+@pytest.mark.parametrize("nothing", ["advantages", "mask"])
+def test_a_batch_that_says_nothing_leaves_the_policy_as_it_is(nothing):
+    policy = random_policy(0, hidden=(5,))
+    batch = a_batch(1, policy)
+    getattr(batch, nothing)[:] = 0
+    new, info = improve(policy, batch, CONFIG)
+    assert not info.accepted
+    assert jax.tree.all(jax.tree.map(np.array_equal, new, policy))
+
+
+def test_masked_steps_have_no_influence():
+    policy = random_policy(3, hidden=(5,))
+    batch = a_batch(4, policy)
+    off = batch.mask == 0
+    dirty = trpo.Batch(
+        np.where(off[:, None], 1e5, batch.states).astype(np.float32),
+        np.where(off[:, None], -3e3, batch.actions).astype(np.float32),
+        np.where(off, 1e6, batch.advantages).astype(np.float32),
+        batch.mask,
+    )
+    clean, info = improve(policy, batch, CONFIG)
+    assert info.accepted
+    for ours, theirs in zip(
+        jax.tree.leaves(improve(policy, dirty, CONFIG)), jax.tree.leaves((clean, info)), strict=True
+    ):
+        np.testing.assert_array_equal(ours, theirs)
+    # and the means are over the steps that count: leaving the others out gives the same
+    kept = trpo.Batch(*(x[~off] for x in batch))
+    for ours, theirs in zip(jax.tree.leaves(improve(policy, kept, CONFIG)[0]), jax.tree.leaves(clean), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-4)
