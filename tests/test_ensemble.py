@@ -78,7 +78,7 @@ def test_normaliser_is_the_mean_and_std_of_the_rows():
         (rng.normal(size=(500, 4)) * scales - 3).astype(np.float32),
         500,
     )
-    n = ensembles.normaliser_of(train, 0.1)
+    n = ensembles.normaliser_of(train, 0.1, 0.1)
     np.testing.assert_allclose(n.state_mean, train.states.mean(0, dtype=np.float64), rtol=1e-5)
     np.testing.assert_allclose(n.action_mean, train.actions.mean(0, dtype=np.float64), atol=1e-6)
     np.testing.assert_allclose(n.delta_mean, train.deltas.mean(0, dtype=np.float64), rtol=1e-5)
@@ -90,7 +90,7 @@ def test_normaliser_is_the_mean_and_std_of_the_rows():
 def test_normaliser_never_divides_by_less_than_the_floor():
     rng = np.random.default_rng(6)
     x = (rng.normal(size=(400, 3)) * [0.0, 0.01, 1.0]).astype(np.float32)
-    n = ensembles.normaliser_of(Transitions(x, x[:, :2], x, 400), 0.25)
+    n = ensembles.normaliser_of(Transitions(x, x[:, :2], x, 400), 0.25, 0.25)
     np.testing.assert_allclose(1 / n.state_scale, [0.25, 0.25, x[:, 2].std()], rtol=1e-4)
     np.testing.assert_allclose(1 / n.action_scale, 0.25, rtol=1e-6)
     np.testing.assert_allclose(n.delta_std, [0.25, 0.25, x[:, 2].std()], rtol=1e-4)
@@ -99,7 +99,7 @@ def test_normaliser_never_divides_by_less_than_the_floor():
 def test_unseen_dimensions_have_no_influence_and_are_predicted_all_the_same():
     rng = np.random.default_rng(8)
     train = random_transitions(rng, 50)
-    normaliser = ensembles.normaliser_of(train, 0.1, unseen=(0, 2))
+    normaliser = ensembles.normaliser_of(train, 0.1, 0.1, unseen=(0, 2))
     ensemble = random_ensemble(9)._replace(normaliser=normaliser)
     states, actions = rng.normal(size=(3, 5, 4)).astype(np.float32), rng.normal(size=(3, 5, 2)).astype(np.float32)
     moved = states + np.array([1000.0, 0.0, -50.0, 0.0], np.float32)

@@ -160,7 +160,7 @@ SHORT = FitConfig(learning_rate=0.01, batch_size=20, validate_every=2, max_passe
 def test_other_members_have_no_influence(k, garbage):
     train, validation = a_system(60)[0], a_system(30, seed=1)[0]
     networks = random_ensemble(1).networks
-    normaliser = ensembles.normaliser_of(train, 0.1)
+    normaliser = ensembles.normaliser_of(train, 0.1, 0.1)
 
     def spoil(x):
         x = np.full_like(x, garbage) if np.isnan(garbage) else garbage * x
@@ -181,7 +181,7 @@ def test_other_members_have_no_influence(k, garbage):
 
 def test_the_first_member_of_many_is_the_only_member_of_one():
     train, validation = a_system(60)[0], a_system(30, seed=1)[0]
-    normaliser = ensembles.normaliser_of(train, 0.1)
+    normaliser = ensembles.normaliser_of(train, 0.1, 0.1)
     three, one = (
         fitting.fit(e.networks, normaliser, train, validation, SHORT, KEY)[0]
         for e in (random_ensemble(1), member(random_ensemble(1), 0))
@@ -192,7 +192,7 @@ def test_the_first_member_of_many_is_the_only_member_of_one():
 
 def test_a_diverged_member_keeps_its_best_weights():
     train, validation = a_system(60)[0], a_system(30, seed=1)[0]
-    start = random_ensemble(2)._replace(normaliser=ensembles.normaliser_of(train, 0.1))
+    start = random_ensemble(2)._replace(normaliser=ensembles.normaliser_of(train, 0.1, 0.1))
     train.deltas[:] = 1e30  # squares overflow: the loss is infinite and the gradient is not a number
     fitted, info = fitting.fit(start.networks, start.normaliser, train, validation, SHORT, KEY)
     assert jax.tree.all(jax.tree.map(np.array_equal, fitted.networks, start.networks))
@@ -244,7 +244,7 @@ def test_fitting_stops_when_no_member_has_improved_for_the_patience(monkeypatch,
 
 def test_capacity_beyond_the_size_has_no_influence():
     train, validation = a_system(60)[0], a_system(30, seed=1)[0]
-    ensemble = random_ensemble(1)._replace(normaliser=ensembles.normaliser_of(train, 0.1))
+    ensemble = random_ensemble(1)._replace(normaliser=ensembles.normaliser_of(train, 0.1, 0.1))
 
     def padded(t, capacity):
         garbage = np.float32(1e4)
@@ -260,7 +260,7 @@ def test_capacity_beyond_the_size_has_no_influence():
 
 def test_the_callers_arrays_stay_usable():
     train, validation = jax.device_put((a_system(60)[0], a_system(30, seed=1)[0]))
-    ensemble = random_ensemble(1)._replace(normaliser=ensembles.normaliser_of(train, 0.1))
+    ensemble = random_ensemble(1)._replace(normaliser=ensembles.normaliser_of(train, 0.1, 0.1))
     given = jax.tree.map(jnp.asarray, (ensemble, train, validation))
     before = jax.tree.map(np.array, given)
     fitting.fit(*given[0], given[1], given[2], SHORT, KEY)
@@ -271,7 +271,7 @@ def test_the_callers_arrays_stay_usable():
 def test_fitting_learns_a_known_system():
     train, (a, b) = a_system(500)
     validation, _ = a_system(200, seed=1)
-    normaliser = ensembles.normaliser_of(train, 0.1)
+    normaliser = ensembles.normaliser_of(train, 0.1, 0.1)
     networks = ensembles.init(jax.random.key(0), 3, 4, 2, (16,))
     config = FitConfig(learning_rate=0.01, batch_size=50, validate_every=5, max_passes=80, patience=25)
     before = fitting.validation_loss(Ensemble(networks, normaliser), validation)

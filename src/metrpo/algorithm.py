@@ -193,7 +193,7 @@ def _fit(
         networks = _fresh_networks(config, task, init_key)
     return fit(
         networks,
-        ensembles.normaliser_of(dataset.train, config.ensemble.std_floor, task.unseen),
+        ensembles.normaliser_of(dataset.train, config.ensemble.std_floor, config.ensemble.delta_std_floor, task.unseen),
         jax.device_put(datasets.with_capacity(dataset.train, config.collect.max_train)),
         jax.device_put(datasets.with_capacity(dataset.validation, config.collect.max_validation)),
         config.fit,

@@ -33,7 +33,7 @@ class CollectConfig:
     std_per: Literal["episode", "step"] = "episode"
     """How often that standard deviation is drawn: once an episode (the paper) or at every step (authors' code)."""
     parameter_noise: float = 3.0
-    """Scale of the parameter noise: std = scale * |policy - previous policy|, redrawn every episode; 0 switches it off."""
+    """Scale of the parameter noise: std = scale * |policy - previous policy|, redrawn every episode; 0: none."""
     validation_fraction: float = 1 / 3
     """Share of the new episodes that goes to the validation set."""
     max_train: int = 200_000
@@ -66,12 +66,15 @@ class EnsembleConfig:
     hidden: tuple[int, ...] = (1024, 1024)
     """Sizes of the hidden layers (ReLU)."""
     std_floor: float = 0.1
-    """Smallest standard deviation that the normaliser divides by."""
+    """Smallest standard deviation of states and actions that the normaliser divides by."""
+    delta_std_floor: float = 0.1
+    """Smallest standard deviation of the change of state that the normaliser multiplies the output by."""
 
     def __post_init__(self) -> None:
         _require(self.members >= 1, "ensemble.members", self.members, "at least 1")
         _require(all(n >= 1 for n in self.hidden), "ensemble.hidden", self.hidden, "sizes of at least 1")
-        _require(_positive(self.std_floor), "ensemble.std_floor", self.std_floor, "a finite number > 0")
+        for name in ("std_floor", "delta_std_floor"):
+            _require(_positive(getattr(self, name)), f"ensemble.{name}", getattr(self, name), "a finite number > 0")
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ class FitConfig:
     learning_rate: float = 1e-3
     """Adam's step size."""
     weight_decay: float = 0.0
-    """Decoupled weight decay (AdamW): each step shrinks the weights, not the biases, by learning_rate * weight_decay."""
+    """Decoupled weight decay (AdamW): each step shrinks weights, not biases, by learning_rate * weight_decay."""
     batch_size: int = 1000
     """Transitions per minibatch, drawn with replacement and for each model independently."""
     loss_units: Literal["raw", "std"] = "raw"

@@ -44,14 +44,16 @@ def init(key: Array, members: int, state_size: int, action_size: int, hidden: tu
     return jax.vmap(one)(jnp.arange(members))
 
 
-def normaliser_of(train: Transitions, std_floor: float, unseen: tuple[int, ...] = ()) -> Normaliser:
+def normaliser_of(
+    train: Transitions, std_floor: float, delta_std_floor: float, unseen: tuple[int, ...] = ()
+) -> Normaliser:
     """Means and standard deviations of training data (host arrays, [n, ...]); never of validation data.
 
     `unseen` state dimensions get scale 0, so that the networks cannot see them.
     """
 
-    def std(x: Array) -> Array:
-        return jnp.maximum(jnp.std(jnp.asarray(x), axis=0), std_floor)
+    def std(x: Array, floor: float = std_floor) -> Array:
+        return jnp.maximum(jnp.std(jnp.asarray(x), axis=0), floor)
 
     state_scale = (1 / std(train.states)).at[jnp.array(unseen, int)].set(0.0)
     return Normaliser(
@@ -60,7 +62,7 @@ def normaliser_of(train: Transitions, std_floor: float, unseen: tuple[int, ...] 
         action_mean=jnp.mean(jnp.asarray(train.actions), axis=0),
         action_scale=1 / std(train.actions),
         delta_mean=jnp.mean(jnp.asarray(train.deltas), axis=0),
-        delta_std=std(train.deltas),
+        delta_std=std(train.deltas, delta_std_floor),
     )
 
 

@@ -14,7 +14,7 @@ from typing import TextIO
 from metrpo import config as configs
 from metrpo.config import Config
 from metrpo.errors import ConfigError, RunDirectoryError
-from metrpo.run.files import FORMAT, atomic_write, check_format, metrpo_version
+from metrpo.run.files import FORMAT, atomic_write, check_format, metrpo_version, source_commit
 
 
 def claim(path: Path, config: Config) -> TextIO:
@@ -78,7 +78,8 @@ def _check_or_describe(file: Path) -> None:
         except (ValueError, TypeError, OSError) as error:
             raise RunDirectoryError(f"{file} is damaged ({error}): put it back or choose another directory") from None
         return
-    about = {"format": FORMAT, "metrpo": metrpo_version(), "python": platform.python_version()}
+    about = {"format": FORMAT, "metrpo": metrpo_version(), "commit": source_commit()}
+    about["python"] = platform.python_version()
     about |= {name: version(name) for name in ("jax", "mujoco", "gymnasium", "numpy")}
     about["created"] = datetime.now(UTC).isoformat(timespec="seconds")
     atomic_write(file, json.dumps(about, indent=2) + "\n")

@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import os
+import subprocess
 import zipfile
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -116,6 +117,24 @@ def metrpo_version() -> str:
         return version("metrpo")
     except PackageNotFoundError:
         return "unknown"
+
+
+def source_commit() -> str | None:
+    """The git commit of the source that runs, "-dirty" appended when it was edited; None outside a git checkout."""
+    source = Path(__file__).resolve().parents[2]
+    try:
+        head = _git(source, "rev-parse", "HEAD")
+        # A package installed inside somebody else's checkout (a .venv there) is not that checkout's.
+        if not _git(source, "ls-files", str(Path(__file__).resolve())):
+            return None
+        return f"{head}-dirty" if _git(source, "status", "--porcelain", "--", str(source)) else head
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def _git(directory: Path, *arguments: str) -> str:
+    command = ["git", "-C", str(directory), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def _digest(body: bytes) -> bytes:
