@@ -257,6 +257,16 @@ def test_help_shows_the_defaults_of_task_and_preset(capsys):
     assert "(default: 32 32)" in " ".join(capsys.readouterr().out.replace("│", " ").split())
 
 
+def test_every_public_name_is_there():
+    stub = sys.modules["metrpo.algorithm"]
+    for name in ("State", "init", "step"):
+        setattr(stub, name, None)
+    assert [name for name in metrpo.__all__ if not hasattr(metrpo, name)] == []
+    assert dir(metrpo) == sorted(metrpo.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = metrpo.nothing
+
+
 def test_version_and_no_arguments(capsys):
     assert run("--version") == 0
     assert capsys.readouterr().out.startswith("metrpo ")

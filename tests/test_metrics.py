@@ -67,6 +67,8 @@ def test_events_hold_every_iteration_once_after_a_resume(tmp_path):
     first = Events(tmp_path, rows[:1])
     first.add(rows[1])
     first.close()
+    (written,) = tmp_path.iterdir()
+    written.rename(tmp_path / "events.out.tfevents.1.elsewhere")  # the name holds the second in which it was written
     second = Events(tmp_path, rows[:2])
     second.add(rows[2])
     second.close()

@@ -18,7 +18,7 @@ from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError, TaskError
 
 if TYPE_CHECKING:
     from metrpo.algorithm import State, init, step, train
-    from metrpo.evaluation import EvaluationResult, evaluate
+    from metrpo.evaluation import EvaluationResult, evaluate, render
     from metrpo.presets import preset
     from metrpo.run.metrics import read_metrics
     from metrpo.run.policy_file import LoadedPolicy, load_policy
@@ -40,6 +40,7 @@ __all__ = [
     "load_policy",
     "preset",
     "read_metrics",
+    "render",
     "step",
     "tasks",
     "train",
@@ -48,7 +49,7 @@ __all__ = [
 # Imported at first use: a policy can be loaded without JAX, and `import metrpo` costs next to nothing.
 _HOME = {
     "metrpo.algorithm": ("State", "init", "step", "train"),
-    "metrpo.evaluation": ("EvaluationResult", "evaluate"),
+    "metrpo.evaluation": ("EvaluationResult", "evaluate", "render"),
     "metrpo.presets": ("preset",),
     "metrpo.run.metrics": ("read_metrics",),
     "metrpo.run.policy_file": ("LoadedPolicy", "load_policy"),

@@ -22,7 +22,7 @@ def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
     Raises `MetrpoError` when `device` is "gpu" and JAX finds none.
     """
     if device is not None:
-        os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda"}[device]
+        os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda,cpu"}[device]
     elif not _may_have_gpu():
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
     if deterministic:
