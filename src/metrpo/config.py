@@ -95,6 +95,8 @@ class FitConfig:
     """Stop when no model has improved its validation loss for this many passes."""
     max_passes: int = 2000
     """Most passes over the training set in one outer iteration."""
+    max_steps: int | None = None
+    """Most minibatches in one outer iteration, whatever the size of the training set; with a warm start they add up."""
     reinitialise_every: int = 5
     """Fresh weights in every n-th outer iteration (1, 1+n, ...), warm start in the others; 0: only in the first."""
 
@@ -103,6 +105,7 @@ class FitConfig:
         _require(_nonnegative(self.weight_decay), "fit.weight_decay", self.weight_decay, "a finite number >= 0")
         for name in ("batch_size", "validate_every", "patience", "max_passes"):
             _require(getattr(self, name) >= 1, f"fit.{name}", getattr(self, name), "at least 1")
+        _require(self.max_steps is None or self.max_steps >= 1, "fit.max_steps", self.max_steps, "at least 1")
         _require(self.reinitialise_every >= 0, "fit.reinitialise_every", self.reinitialise_every, "at least 0")
 
 

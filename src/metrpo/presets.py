@@ -33,17 +33,20 @@ PAPER: dict[str, Overrides] = {
 
 FAST_ALL: Overrides = {
     "ensemble.hidden": (200, 200),
-    "ensemble.std_floor": 1e-4,
+    "ensemble.delta_std_floor": 1e-4,
     "fit.batch_size": 250,
     "fit.loss_units": "std",
+    "fit.max_steps": 4000,
     "fit.patience": 10,
     "fit.reinitialise_every": 0,
-    "imagine.steps": 30_000,
+    "fit.weight_decay": 0.3,
+    "imagine.steps": 40_000,
+    "validate.max_updates": 100,
     "validate.starts": 50,
 }
 
 FAST: dict[str, Overrides] = {
-    "Swimmer": {"iterations": 10},
+    "Swimmer": {"iterations": 10, "imagine.steps": 30_000, "validate.max_updates": 60},
     "Snake": {"iterations": 20},
     "Hopper": {"iterations": 20},
     "HalfCheetah": {"iterations": 20},

@@ -5,6 +5,7 @@ Paper, section 4.1 (the L2 one-step loss) and appendix A.1.2 (batch, passes, pat
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
@@ -54,7 +55,8 @@ def fit(
 ) -> tuple[Ensemble, FitInfo]:
     """The ensemble fitted to `train`, each member at its own best validation loss.
 
-    Stops when no member has improved for `config.patience` passes, at the latest after `config.max_passes`.
+    Stops when no member has improved for `config.patience` passes, at the latest after `config.max_passes` or
+    `config.max_steps`.
     `on_validation(passes, best losses [K])` is called at every validation. Adam starts afresh.
     """
     optimizer = _optimizer(config)
@@ -62,9 +64,11 @@ def fit(
     at = _Progress(networks, optimizer.init(networks), networks, loss, jnp.zeros(loss.shape, jnp.int32), loss)
     at = jax.tree.map(jnp.copy, at)  # its buffers are given away below, the caller's are not
     # At least one step a pass: the first iterations of a small task may have fewer transitions than a minibatch.
-    steps = max(1, int(train.size) // config.batch_size) * config.validate_every
+    steps_per_pass = max(1, int(train.size) // config.batch_size)
+    steps = steps_per_pass * config.validate_every
+    max_passes = min(config.max_passes, (config.max_steps or math.inf) / steps_per_pass)
     passes = 0
-    while passes < config.max_passes and passes - int(at.best_pass.max()) < config.patience:
+    while passes < max_passes and passes - int(at.best_pass.max()) < config.patience:
         passes += config.validate_every
         at = _train_and_validate(at, normaliser, train, validation, config, key, jnp.int32(steps), jnp.int32(passes))
         on_validation(passes, at.best_loss)
