@@ -105,8 +105,8 @@ def _episode(
 def _frame(env: Any) -> np.ndarray:
     try:
         picture = env.render()
-    except MetrpoError:
-        raise
+    except MetrpoError as error:
+        raise VideoError(str(error)) from error
     except Exception as error:  # every GL library fails in its own way
         raise VideoError(
             f"cannot render here ({type(error).__name__}: {error}): {INSTALL_GL}; see: metrpo doctor"
