@@ -12,6 +12,16 @@ from metrpo.policy import gaussian
 from metrpo.types import Episode, Normaliser, Transitions
 
 
+def on_host(**jit):
+    """jax.jit with results as NumPy arrays, for every operation on a JAX array is compiled by itself."""
+
+    def wrap(function):
+        compiled = jax.jit(function, **jit)
+        return lambda *args, **kwargs: jax.device_get(compiled(*args, **kwargs))
+
+    return wrap
+
+
 def identity_normaliser(state_size, action_size):
     s, a = np.ones(state_size, np.float32), np.ones(action_size, np.float32)
     return Normaliser(0 * s, s, 0 * a, a, 0 * s, s)

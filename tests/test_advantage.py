@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from helpers import on_host
 from metrpo.policy import advantage
 from metrpo.types import Trajectories
 
 T, N, S = 12, 5, 3
-# Compiled once for all the examples.
-discounted_returns, gae, standardise = (
-    jax.jit(f) for f in (advantage.discounted_returns, advantage.gae, advantage.standardise)
+discounted_returns, gae, standardise, features, fit_baseline, advantages_and_baseline = (
+    on_host()(f)
+    for f in (
+        advantage.discounted_returns,
+        advantage.gae,
+        advantage.standardise,
+        advantage.features,
+        advantage.fit_baseline,
+        advantage.advantages_and_baseline,
+    )
 )
-features, fit_baseline = jax.jit(advantage.features), jax.jit(advantage.fit_baseline)
-advantages_and_baseline = jax.jit(advantage.advantages_and_baseline)
 seeds = st.integers(0, 2**31 - 1)
 shares = st.sampled_from([0.0, 0.3, 0.9, 0.99, 1.0])
 

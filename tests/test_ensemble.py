@@ -9,6 +9,7 @@ import pytest
 from helpers import (
     linear_ensemble,
     member,
+    on_host,
     random_ensemble,
     random_normaliser,
     random_transitions,
@@ -17,16 +18,18 @@ from helpers import (
 from metrpo.model import ensemble as ensembles
 from metrpo.types import Transitions
 
+predict, predict_delta = on_host()(ensembles.predict), on_host()(ensembles.predict_delta)
+
 
 @pytest.mark.parametrize("hidden", [(), (8,), (8, 6)])
 def test_prediction_is_each_members_own_relu_network(hidden):
     rng = np.random.default_rng(0)
     ensemble = random_ensemble(1, members=3, hidden=hidden)
     states, actions = rng.normal(size=(3, 5, 4)).astype(np.float32), rng.normal(size=(3, 5, 2)).astype(np.float32)
-    delta = ensembles.predict_delta(ensemble, states, actions)
+    delta = predict_delta(ensemble, states, actions)
     expected = [[slow_delta(ensemble, k, states[k, b], actions[k, b]) for b in range(5)] for k in range(3)]
     np.testing.assert_allclose(delta, expected, atol=1e-5)
-    np.testing.assert_allclose(ensembles.predict(ensemble, states, actions), states + expected, atol=1e-5)
+    np.testing.assert_allclose(predict(ensemble, states, actions), states + expected, atol=1e-5)
     assert ensemble.members == 3
 
 
@@ -38,21 +41,21 @@ def test_a_linear_system_can_be_written_as_an_ensemble(relu):
     ensemble = linear_ensemble(matrices, random_normaliser(rng, 4, 2), relu)
     states, actions = rng.normal(size=(2, 6, 4)).astype(np.float32), rng.normal(size=(2, 6, 2)).astype(np.float32)
     expected = [s @ a.T + u @ b.T for (a, b), s, u in zip(matrices, states, actions, strict=True)]
-    np.testing.assert_allclose(ensembles.predict(ensemble, states, actions), expected, atol=1e-4)
+    np.testing.assert_allclose(predict(ensemble, states, actions), expected, atol=1e-4)
 
 
 def test_a_member_alone_predicts_as_in_the_ensemble():
     rng = np.random.default_rng(3)
     ensemble = random_ensemble(4)
     states, actions = rng.normal(size=(3, 5, 4)).astype(np.float32), rng.normal(size=(3, 5, 2)).astype(np.float32)
-    together = ensembles.predict(ensemble, states, actions)
+    together = predict(ensemble, states, actions)
     for k in range(3):
-        alone = ensembles.predict(member(ensemble, k), states[k : k + 1], actions[k : k + 1])
+        alone = predict(member(ensemble, k), states[k : k + 1], actions[k : k + 1])
         np.testing.assert_allclose(alone[0], together[k], atol=1e-6)
 
 
 def test_fresh_members_are_xavier_uniform_and_differ():
-    networks = ensembles.init(jax.random.key(0), 4, 30, 10, (50,))
+    networks = jax.device_get(ensembles.init(jax.random.key(0), 4, 30, 10, (50,)))
     assert [(w.shape, b.shape) for w, b in networks] == [((4, 40, 50), (4, 1, 50)), ((4, 50, 30), (4, 1, 30))]
     for weights, biases in networks:
         bound = np.sqrt(6 / (weights.shape[1] + weights.shape[2]))
@@ -103,10 +106,10 @@ def test_unseen_dimensions_have_no_influence_and_are_predicted_all_the_same():
     ensemble = random_ensemble(9)._replace(normaliser=normaliser)
     states, actions = rng.normal(size=(3, 5, 4)).astype(np.float32), rng.normal(size=(3, 5, 2)).astype(np.float32)
     moved = states + np.array([1000.0, 0.0, -50.0, 0.0], np.float32)
-    deltas = np.asarray(ensembles.predict_delta(ensemble, states, actions))
-    np.testing.assert_array_equal(ensembles.predict_delta(ensemble, moved, actions), deltas)
+    deltas = np.asarray(predict_delta(ensemble, states, actions))
+    np.testing.assert_array_equal(predict_delta(ensemble, moved, actions), deltas)
     assert np.all(np.ptp(deltas, axis=1) > 1e-3), "every dimension, unseen ones too, is predicted from the others"
     seen = states + np.array([0.0, 1.0, 0.0, 0.0], np.float32)
-    assert not np.allclose(ensembles.predict_delta(ensemble, seen, actions), deltas)
+    assert not np.allclose(predict_delta(ensemble, seen, actions), deltas)
     # What normalises the prediction of an unseen dimension is its own spread.
     np.testing.assert_allclose(normaliser.delta_std, train.deltas.std(0), rtol=1e-4)

@@ -20,6 +20,11 @@ from metrpo.types import Transitions
 KEY = jax.random.key(0)
 
 
+def fit(*args):
+    """The fit with its results as NumPy arrays: every operation on a JAX array would be compiled by itself."""
+    return jax.device_get(fitting.fit(*args))
+
+
 def slow_validation_loss(ensemble, validation, loss_units="raw"):
     size = int(validation.size)
     unit = np.asarray(ensemble.normaliser.delta_std, np.float64) if loss_units == "std" else 1.0
@@ -124,7 +129,7 @@ def test_every_member_is_trained_alone_and_goes_back_to_its_own_best(size, confi
     ensemble = random_ensemble(3, hidden=(8,))
     rng = np.random.default_rng(size)
     train, validation = random_transitions(rng, size, capacity=40), random_transitions(rng, 30)
-    fitted, info = fitting.fit(ensemble.networks, ensemble.normaliser, train, validation, config, KEY)
+    fitted, info = fit(ensemble.networks, ensemble.normaliser, train, validation, config, KEY)
     best_blocks = []
     for k in range(3):
         losses, layers = slow_fit(ensemble, k, train, validation, config)
@@ -169,9 +174,7 @@ def test_other_members_have_no_influence(k, garbage):
 
     others = np.arange(3).reshape(3, 1, 1) != k
     spoilt = jax.tree.map(lambda x: np.where(others, spoil(x), x).astype(np.float32), networks)
-    (clean, info), (dirty, dirty_info) = (
-        fitting.fit(n, normaliser, train, validation, SHORT, KEY) for n in (networks, spoilt)
-    )
+    (clean, info), (dirty, dirty_info) = (fit(n, normaliser, train, validation, SHORT, KEY) for n in (networks, spoilt))
     for ours, theirs in zip(member(dirty, k).networks, member(clean, k).networks, strict=True):
         np.testing.assert_allclose(ours[0], theirs[0], atol=1e-6)
         np.testing.assert_allclose(ours[1], theirs[1], atol=1e-6)
@@ -183,7 +186,7 @@ def test_the_first_member_of_many_is_the_only_member_of_one():
     train, validation = a_system(60)[0], a_system(30, seed=1)[0]
     normaliser = ensembles.normaliser_of(train, 0.1, 0.1)
     three, one = (
-        fitting.fit(e.networks, normaliser, train, validation, SHORT, KEY)[0]
+        fit(e.networks, normaliser, train, validation, SHORT, KEY)[0]
         for e in (random_ensemble(1), member(random_ensemble(1), 0))
     )
     for ours, theirs in zip(jax.tree.leaves(member(three, 0).networks), jax.tree.leaves(one.networks), strict=True):
@@ -194,7 +197,7 @@ def test_a_diverged_member_keeps_its_best_weights():
     train, validation = a_system(60)[0], a_system(30, seed=1)[0]
     start = random_ensemble(2)._replace(normaliser=ensembles.normaliser_of(train, 0.1, 0.1))
     train.deltas[:] = 1e30  # squares overflow: the loss is infinite and the gradient is not a number
-    fitted, info = fitting.fit(start.networks, start.normaliser, train, validation, SHORT, KEY)
+    fitted, info = fit(start.networks, start.normaliser, train, validation, SHORT, KEY)
     assert jax.tree.all(jax.tree.map(np.array_equal, fitted.networks, start.networks))
     assert not np.any(info.best_pass)
     assert np.all(np.isfinite(info.validation_loss))
@@ -233,7 +236,7 @@ def test_fitting_stops_when_no_member_has_improved_for_the_patience(monkeypatch,
     def tell(passes, losses):
         told.append((passes, np.array(losses)))
 
-    _, info = fitting.fit(*ensemble, train, validation, config, KEY, tell)
+    _, info = fit(*ensemble, train, validation, config, KEY, tell)
     assert info.passes == passes
     every = config.validate_every
     # 3,500 rows are 3 minibatches of 1,000: a pass is 3 steps, whatever the capacity.
@@ -252,8 +255,8 @@ def test_capacity_beyond_the_size_has_no_influence():
             *(np.pad(x, ((0, capacity - len(x)), (0, 0)), constant_values=garbage) for x in t[:3]), t.size
         )
 
-    exact = fitting.fit(*ensemble, train, validation, SHORT, KEY)
-    roomy = fitting.fit(*ensemble, padded(train, 100), padded(validation, 1500), SHORT, KEY)
+    exact = fit(*ensemble, train, validation, SHORT, KEY)
+    roomy = fit(*ensemble, padded(train, 100), padded(validation, 1500), SHORT, KEY)
     for ours, theirs in zip(jax.tree.leaves(roomy), jax.tree.leaves(exact), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-6)
 
@@ -263,7 +266,7 @@ def test_the_callers_arrays_stay_usable():
     ensemble = random_ensemble(1)._replace(normaliser=ensembles.normaliser_of(train, 0.1, 0.1))
     given = jax.tree.map(jnp.asarray, (ensemble, train, validation))
     before = jax.tree.map(np.array, given)
-    fitting.fit(*given[0], given[1], given[2], SHORT, KEY)
+    fit(*given[0], given[1], given[2], SHORT, KEY)
     assert not any(x.is_deleted() for x in jax.tree.leaves(given))
     assert jax.tree.all(jax.tree.map(np.array_equal, given, before))
 
@@ -280,7 +283,7 @@ def test_fitting_learns_a_known_system():
     def keep(passes, loss):
         losses.append(np.array(loss))
 
-    fitted, info = fitting.fit(networks, normaliser, train, validation, config, KEY, keep)
+    fitted, info = fit(networks, normaliser, train, validation, config, KEY, keep)
     assert np.all(info.validation_loss < 0.01 * before)
     assert np.all(np.diff(np.array([before, *losses]), axis=0) <= 0), "the best so far never gets worse"
     fresh, _ = a_system(50, seed=2)

@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 import probe
-from helpers import linear_ensemble, random_ensemble, random_normaliser, random_policy, slow_delta, slow_mean
+from helpers import linear_ensemble, on_host, random_ensemble, random_normaliser, random_policy, slow_delta, slow_mean
 from metrpo.model import imagine as imagining
 from metrpo.model.ensemble import Ensemble
 from metrpo.model.imagine import imagine, model_choice, returns_per_model, step_rand
@@ -20,20 +20,27 @@ from metrpo.policy import gaussian
 KEY = jax.random.key(0)
 
 
-@partial(jax.jit, static_argnames=("terminated", "horizon"))
+@on_host(static_argnames=("terminated", "horizon"))
 def imagined(ensemble, policy, starts, key, terminated=None, horizon=probe.HORIZON):
     return imagine(ensemble, partial(gaussian.sample, policy), probe.reward, terminated, starts, horizon, key)
 
 
-@partial(jax.jit, static_argnames=("reward", "terminated", "horizon"))
+@on_host(static_argnames=("reward", "terminated", "horizon"))
 def imagined_without_policy(ensemble, starts, key, reward, terminated=None, horizon=10):
     return imagine(ensemble, lambda s, k: jnp.zeros((len(s), 1)), reward, terminated, starts, horizon, key)
 
 
-def returns(ensemble, policy, starts, reward=probe.reward, terminated=None, horizon=probe.HORIZON):
-    return jax.jit(
-        lambda: returns_per_model(ensemble, partial(gaussian.mean, policy), reward, terminated, starts, horizon)
-    )()
+@on_host(static_argnames=("terminated", "horizon"))
+def returns(ensemble, policy, starts, terminated=None, horizon=probe.HORIZON):
+    return returns_per_model(ensemble, partial(gaussian.mean, policy), probe.reward, terminated, starts, horizon)
+
+
+@on_host(static_argnames=("reward", "terminated", "horizon"))
+def returns_without_policy(ensemble, starts, reward, terminated=None, horizon=10):
+    return returns_per_model(ensemble, lambda s: 0 * s, reward, terminated, starts, horizon)
+
+
+model_choices = jax.jit(jax.vmap(model_choice, (0, None, None)), static_argnums=(1, 2))
 
 
 def true_dynamics(members=3, relu=True, seed=0):
@@ -142,28 +149,23 @@ def large(next_state):
     return next_state[..., 0] > 50
 
 
-def still(states):
-    return 0 * states
-
-
 def test_a_diverged_model_has_no_value_and_spoils_no_other():
     starts = np.array([[0.0], [0.5], [1.0]], np.float32)
-    nothing = growing([1.0, 10.0, np.nan, 0.5])
-    got = returns_per_model(nothing, still, plain, None, starts, 10)
+    got = returns_without_policy(growing([1.0, 10.0, np.nan, 0.5]), starts, plain)
     assert got[0] == pytest.approx(0.5 * 10)
     assert np.isnan(got[1])
     assert np.isnan(got[2])
     assert got[3] == pytest.approx(0.5 * (1 - 0.5**10), rel=1e-5)
     # One rollout that explodes among others that do not is enough; one that stays below the limit is not.
-    assert np.isnan(returns_per_model(growing([10.0]), still, plain, None, np.array([[0.0], [1.0]], np.float32), 6)[0])
-    below = returns_per_model(growing([10.0]), still, plain, None, np.array([[0.0], [0.99]], np.float32), 6)
+    assert np.isnan(returns_without_policy(growing([10.0]), np.array([[0.0], [1.0]], np.float32), plain, None, 6)[0])
+    below = returns_without_policy(growing([10.0]), np.array([[0.0], [0.99]], np.float32), plain, None, 6)
     assert below[0] == pytest.approx(0.99 * 1_111_110 / 2, rel=1e-5)
 
 
 @pytest.mark.parametrize("reward", [plain, squared])
 def test_what_a_model_does_after_the_end_does_not_count(reward):
     """1 -> 10 -> 100 ends there; beyond, the model explodes and its squares overflow."""
-    value = returns_per_model(growing([10.0]), still, reward, large, np.ones((1, 1), np.float32), 45)
+    value = returns_without_policy(growing([10.0]), np.ones((1, 1), np.float32), reward, large, 45)
     assert value[0] == (110 if reward is plain else -10_100)
 
 
@@ -233,8 +235,7 @@ def test_a_rollout_that_ends_before_it_explodes_counts():
 @pytest.mark.parametrize(("count", "members"), [(12, 3), (13, 5), (3, 5), (7, 1)])
 def test_model_choice_is_uniform_for_every_state(count, members):
     draws = 3000
-    slots, models = jax.vmap(lambda k: model_choice(k, count, members))(jax.random.split(KEY, draws))
-    slots, models = np.asarray(slots), np.asarray(models)
+    slots, models = jax.device_get(model_choices(jax.random.split(KEY, draws), count, members))
     table = np.array([np.bincount(column, minlength=members) for column in models.T])
     assert table.shape == (count, members)
     for row in table:
