@@ -238,7 +238,7 @@ def _improve(
         fractions.append(verdict.fraction_improved)
         if verdict.accepted:
             accepted, reference, accepted_at = policy, values, updates
-        progress.update(updates, f"accepted {accepted_at}, imagined return {np.nanmean(reference):.2f}")
+        progress.update(updates, f"accepted {accepted_at}, imagined return {np.mean(reference):.2f}")
     improve_info, imagine_info = jax.tree.map(lambda *xs: np.concatenate(xs), *infos)
     return (
         accepted,

@@ -1,0 +1,54 @@
+"""The results table of the README, from the committed metrics: `python benchmarks/summarise.py [results/fast ...]`.
+
+One row for each task and system under the given folders: over seeds, the last and the best real return (deterministic
+policy, mean of 20 episodes), the real steps they took, and the minutes of wall-clock time.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from metrpo import read_metrics
+
+ROOT = Path(__file__).resolve().parents[1] / "results"
+HEADER = ("experiment", "task", "system", "seeds", "real steps", "last return", "best return", "last gap", "minutes")
+
+
+def systems(folders: list[Path]) -> list[Path]:
+    """Every <experiment>/<task>/<system> folder that holds seeds."""
+    found = {run.parent.parent for folder in folders for run in folder.rglob("seed-*/metrics.csv")}
+    return sorted(found)
+
+
+def row(system: Path) -> tuple[str, ...]:
+    """The table row of one system."""
+    runs = [read_metrics(path) for path in sorted(system.glob("seed-*/metrics.csv"))]
+
+    def over_seeds(values: list[float], digits: int = 1) -> str:
+        spread = f" ({', '.join(f'{v:.{digits}f}' for v in values)})" if len(values) > 1 else ""
+        return f"{np.mean(values):.{digits}f}{spread}"
+
+    return (
+        system.parent.parent.name,
+        system.parent.name,
+        system.name,
+        str(len(runs)),
+        f"{min(run[-1]['real_steps'] for run in runs):,}",
+        over_seeds([run[-1]["return_real"] for run in runs]),
+        over_seeds([max(r["return_real"] for r in run) for run in runs]),
+        over_seeds([run[-1]["gap"] for run in runs]),
+        over_seeds([run[-1]["wall_seconds"] / 60 for run in runs]),
+    )
+
+
+def table(folders: list[Path]) -> str:
+    """The whole table as Markdown."""
+    rows = [HEADER, tuple("---" for _ in HEADER), *(row(system) for system in systems(folders))]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
+
+
+if __name__ == "__main__":
+    print(table([Path(argument) for argument in sys.argv[1:]] or [ROOT]))
