@@ -6,6 +6,7 @@ The defaults are the paper's values (its appendix A.1) or, where it is silent, i
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -300,25 +301,30 @@ def _build(cls: type, data: object, where: str) -> Any:
     wrong = [f"missing {n}" for n in names if n not in data] + [f"unknown {n}" for n in data if n not in names]
     if wrong:
         raise ConfigError(f"{where}: expected exactly the settings of this version, got {', '.join(wrong)}")
-    return cls(**{name: _convert(hints[name], data[name], f"{where}.{name}") for name in names})
+    return cls(**{name: convert(hints[name], data[name], f"{where}.{name}") for name in names})
 
 
-def _convert(kind: Any, value: Any, where: str) -> Any:
+def convert(kind: Any, value: Any, where: str) -> Any:
+    """`value` as a setting of type `kind` takes it: whole numbers for fractions, lists for tuples.
+
+    Raises `ConfigError`, beginning with `where`, when it is of another type or none of the choices.
+    """
     if dataclasses.is_dataclass(kind):
-        return _build(typing.cast(type, kind), value, where)
+        return value if isinstance(value, typing.cast(type, kind)) else _build(typing.cast(type, kind), value, where)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is types.UnionType:
-        return None if value is None else _convert(arguments[0], value, where)
+        return None if value is None else convert(arguments[0], value, where)
     if origin is Literal:
         if value not in arguments:
             raise ConfigError(f"{where}: expected one of {', '.join(map(str, arguments))}, got {value!r}")
         return value
     if origin is tuple:
-        if not isinstance(value, list):
+        if not isinstance(value, list | tuple):
             raise ConfigError(f"{where}: expected a list, got {value!r}")
-        return tuple(_convert(arguments[0], item, where) for item in value)
+        return tuple(convert(arguments[0], item, where) for item in value)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
+        with contextlib.suppress(OverflowError):
+            return float(value)
     if type(value) is not kind:
         raise ConfigError(f"{where}: expected {kind.__name__}, got {value!r}")
     return value

@@ -8,9 +8,10 @@ cores; how its values were chosen is in `docs/fast-preset.md`.
 from __future__ import annotations
 
 import dataclasses
+import typing
 from typing import Any, Literal, cast
 
-from metrpo.config import Config
+from metrpo.config import Config, convert
 from metrpo.errors import ConfigError
 
 Overrides = dict[str, Any]
@@ -74,7 +75,7 @@ def preset(task: str, name: str = "fast", **top_level: Any) -> Config:
 def override(config: Config, values: Overrides) -> Config:
     """The config with dotted settings replaced: `override(config, {"fit.learning_rate": 1e-3})`.
 
-    Raises `ConfigError` for an unknown setting or an impossible value.
+    Raises `ConfigError` for an unknown setting, a value of the wrong type or an impossible one.
     """
     for name, value in values.items():
         config = _replace(config, name.split("."), value, name)
@@ -86,4 +87,6 @@ def _replace(node: Any, path: list[str], value: Any, name: str) -> Any:
         raise ConfigError(f"unknown setting {name!r} (see: metrpo train --help)")
     if len(path) > 1:
         value = _replace(getattr(node, path[0]), path[1:], value, name)
+    else:
+        value = convert(typing.get_type_hints(type(node))[path[0]], value, name)
     return dataclasses.replace(cast(Any, node), **{path[0]: value})
