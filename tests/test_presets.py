@@ -1,0 +1,145 @@
+"""The presets: `paper` held against the paper value by value, `fast` possible for every task."""
+
+from __future__ import annotations
+
+import pytest
+
+from metrpo.config import Config, flatten, from_json, to_json
+from metrpo.errors import ConfigError
+from metrpo.presets import preset
+from metrpo.world.task import tasks
+
+TASKS = ["Swimmer", "Snake", "Hopper", "HopperUpright", "HalfCheetah", "Ant", "Humanoid", "HumanoidStandup"]
+
+# Setting -> (value, where it is written). "A.1" is the paper's appendix "Model-Ensemble Trust-Region Policy
+# Optimization"; "code" is the authors' published code, which fills in what the paper leaves out.
+CITED = {
+    "improver": ("trpo", 'section 4, "Policy Optimization": the best results were achieved by TRPO'),
+    "collect.steps": (3000, "A.1.1: 3000 timesteps of real world data for every environment, except Humanoid"),
+    "collect.max_std": (3.0, "A.1.1: standard deviation sampled from U[0.0, 3.0]"),
+    "collect.std_per": ("episode", "A.1.1: at the beginning of every roll-out, fixed throughout the episode"),
+    "collect.parameter_noise": (3.0, "A.1.1: proportional to the absolute difference of parameters; factor 3.0: code"),
+    "collect.validation_fraction": (1 / 3, "A.1.1: 2-to-1 ratio for training and validation"),
+    "collect.max_train": (200_000, "code: first in, first out"),
+    "collect.max_validation": (100_000, "code: first in, first out"),
+    "ensemble.members": (5, 'B, "Ablation study": ME-TRPO with 5 models'),
+    "ensemble.hidden": ((1024, 1024), "A.1.2: hidden sizes 1024-1024"),
+    "ensemble.std_floor": (0.1, "code: floor of the normaliser"),
+    "ensemble.delta_std_floor": (0.1, "code: floor of the normaliser, one for inputs and outputs"),
+    "fit.learning_rate": (0.001, "A.1.2: Adam with learning rate 0.001"),
+    "fit.batch_size": (1000, "A.1.2: batch size of 1000"),
+    "fit.loss_units": ("raw", "equation 1: the L2 norm of the error in the state"),
+    "fit.validate_every": (5, "A.1.2: we validate the training every 5 passes"),
+    "fit.patience": (25, "A.1.2: until the validation loss has not decreased for 25 passes"),
+    "fit.max_passes": (2000, "code"),
+    "fit.reinitialise_every": (5, "code: iterations 1, 6, 11, ..."),
+    "imagine.steps": (50_000, "A.1.3: batch size 50000"),
+    "imagine.sampling": ("step_rand", "section 4: in every step, we randomly choose a model"),
+    "imagine.start": ("dataset", "footnote in section 3.2: initial states chosen from the sampled trajectories"),
+    "policy.hidden": ((32, 32), "A.1.3: hidden sizes 32-32, except Humanoid"),
+    "policy.initial_std": (1.0, "A.1.3: initial standard deviation 1.0"),
+    "advantage.discount": (1.0, "section 2: the undiscounted sum of rewards; code: gamma 1"),
+    "advantage.gae_lambda": (1.0, "code"),
+    "advantage.ridge": (1e-5, "code: linear feature baseline"),
+    "trpo.max_kl": (0.01, "A.1.3: step size delta_KL 0.01"),
+    "trpo.cg_iterations": (10, "code"),
+    "trpo.damping": (1e-5, "code"),
+    "trpo.backtrack_ratio": (0.8, "code"),
+    "trpo.max_backtracks": (15, "code"),
+    "validate.rule": ("ensemble", "equation 5: the ratio of models in which the policy improves"),
+    "validate.every": (5, 'section 4, "Policy Validation": after every 5 gradient updates'),
+    "validate.threshold": (0.7, 'section 4, "Policy Validation": 70% as the threshold'),
+    "validate.patience": (25, "A.1.3: if the policy fails the validation for 25 updates"),
+    "validate.starts": (500, "code: fixed start states"),
+}
+
+HUMANOID = {
+    "collect.steps": (6000, "A.1.1: except Humanoid in which we collect 6000 timesteps"),
+    "collect.max_train": (400_000, "code"),
+    "policy.hidden": ((100, 50, 25), "A.1.3: except Humanoid, hidden sizes 100-50-25"),
+    "validate.starts": (32, "code"),
+}
+
+CITED_BY_TASK = {
+    "Swimmer": {
+        "collect.max_train": (100_000, "code"),
+        "collect.max_validation": (50_000, "code"),
+    },
+    "Humanoid": HUMANOID,
+    "HumanoidStandup": HUMANOID,
+}
+
+# Real steps of the paper's learning curves (its figure "data-comparison"); iterations are these by the steps of each.
+REAL_STEPS = {**dict.fromkeys(TASKS, 300_000), "Ant": 600_000, "Humanoid": 2_400_000, "HumanoidStandup": 2_400_000}
+
+# Setting -> (value, why it is not the paper's to decide).
+OURS = {
+    "preset": ("paper", "the label"),
+    "seed": (0, "any will do"),
+    "real_steps": (None, "the budget is given in iterations"),
+    "evaluation_episodes": (20, "reporting only: nothing is learned from it"),
+    "deterministic": (False, "how the machine computes, not what"),
+    "fit.weight_decay": (0.0, "an option of `fast`; the paper knows none, so it is off"),
+    "fit.max_steps": (None, "an option of `fast`; the paper knows none, so it is off"),
+    "validate.max_updates": (400, "a bound that keeps one phase from running forever"),
+}
+
+
+def test_the_tasks_of_this_table_are_all_there_are():
+    assert set(TASKS) <= set(tasks())
+    assert {n for n, t in tasks().items() if t.env_id.startswith("metrpo/")} == set(TASKS)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_paper_preset_is_the_papers_value_by_value(task):
+    expected = {name: value for name, (value, _) in (CITED | OURS | CITED_BY_TASK.get(task, {})).items()}
+    expected["task"] = task
+    expected["iterations"] = REAL_STEPS[task] // expected["collect.steps"]
+    assert flatten(preset(task, "paper")) == expected
+
+
+def test_every_value_has_its_source():
+    for row in (CITED, OURS, *CITED_BY_TASK.values()):
+        assert all(len(why) >= 4 for _, why in row.values())
+    assert not CITED.keys() & OURS.keys()
+
+
+@pytest.mark.parametrize("name", ["fast", "paper"])
+@pytest.mark.parametrize("task", TASKS)
+def test_every_preset_can_be_built_and_written(task, name):
+    config = preset(task, name)
+    assert (config.task, config.preset) == (task, name)
+    assert from_json(to_json(config)) == config
+    assert hash(config) == hash(preset(task, name))
+
+
+def test_fast_is_the_default():
+    assert preset("Swimmer") == preset("Swimmer", "fast")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_fast_collects_and_explores_as_the_paper_does(task):
+    """It may learn from the data in another way, but it gets no other data."""
+    fast, paper = preset(task), preset(task, "paper")
+    assert fast.collect.steps == paper.collect.steps
+    assert fast.validate.threshold == paper.validate.threshold
+    assert fast.policy == paper.policy
+
+
+@pytest.mark.parametrize(("variant", "task"), [("HopperUpright", "Hopper"), ("HumanoidStandup", "Humanoid")])
+@pytest.mark.parametrize("name", ["fast", "paper"])
+def test_variants_share_their_tasks_settings(variant, task, name):
+    assert flatten(preset(variant, name)) == flatten(preset(task, name)) | {"task": variant}
+
+
+def test_settings_on_top():
+    config = preset("Swimmer", "paper", seed=3, iterations=2)
+    assert (config.seed, config.iterations) == (3, 2)
+    assert isinstance(config, Config)
+
+
+def test_an_unknown_preset_is_refused():
+    with pytest.raises(ConfigError, match="preset: expected fast or paper, got 'quick'"):
+        preset("Swimmer", "quick")
+    with pytest.raises(ConfigError, match="unknown setting 'colour'"):
+        preset("Swimmer", colour=1)
