@@ -96,7 +96,7 @@ def load_policy(directory: str | Path) -> LoadedPolicy:
     Raises `RunDirectoryError` when there is none, or it is damaged or of another version.
     """
     path = Path(directory)
-    path = path / FILE if path.is_dir() else path
+    path = path if path.suffix == ".npz" else path / FILE
     if not path.exists():
         raise RunDirectoryError(
             f"{directory} holds no policy: expected {path}; train one with: metrpo train TASK --run-dir {directory}"
