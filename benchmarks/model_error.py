@@ -1,0 +1,66 @@
+"""How wrong the models of a run are: `python benchmarks/model_error.py RUN_DIR [--episodes 20]`.
+
+Plays fresh real episodes with the run's policy and its exploration noise, which the models never saw, and lets every
+member predict them open-loop for 1, 10 and 50 steps from every state, given the real actions. Printed for each state
+dimension: root mean square error of the prediction over that of predicting no change (1: no better than that).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from metrpo import algorithm, config, get_task
+from metrpo.model import ensemble as ensembles
+from metrpo.policy import gaussian
+from metrpo.run.checkpoint import load_state
+from metrpo.types import Episode
+from metrpo.world.collect import collect
+
+
+def relative_error(ensemble: ensembles.Ensemble, episodes: list[Episode], steps: int) -> np.ndarray:
+    """[S]: error after `steps` predicted steps, over the error of standing still; mean over starts and members."""
+    starts, actions, ends = [], [], []
+    for e in episodes:
+        for t in range(len(e.actions) - steps + 1):
+            starts.append(e.states[t])
+            actions.append(e.actions[t : t + steps])
+            ends.append(e.states[t + steps])
+    states = jnp.broadcast_to(jnp.array(starts), (ensemble.members, *np.shape(starts)))
+    for step in range(steps):
+        action = jnp.array(actions)[:, step]
+        states = ensembles.predict(ensemble, states, jnp.broadcast_to(action, (ensemble.members, *action.shape)))
+    error = np.asarray(states) - np.array(ends)
+    still = np.array(starts) - np.array(ends)
+    return np.sqrt(np.mean(error**2, axis=(0, 1)) / np.mean(still**2, axis=0))
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("run_dir", type=Path)
+    parser.add_argument("--episodes", type=int, default=20)
+    arguments = parser.parse_args()
+    settings = config.from_json((arguments.run_dir / "config.json").read_text())
+    task = get_task(settings.task)
+    newest = sorted((arguments.run_dir / "checkpoints").glob("*.npz"))[-1]
+    state, _ = load_state(newest, algorithm.init(settings))
+    e = settings.ensemble
+    normaliser = ensembles.normaliser_of(state.dataset.train, e.std_floor, e.delta_std_floor, task.unseen)
+    ensemble = ensembles.Ensemble(state.networks, normaliser)
+    act = partial(gaussian.mean, jax.tree.map(np.asarray, state.policy))
+    noise = dataclasses.replace(settings.collect, steps=arguments.episodes * task.horizon)
+    episodes = collect(task, lambda _: act, noise, np.random.default_rng(2**40))
+    print(f"{task.name}, iteration {state.iteration}, {len(episodes)} fresh episodes; error relative to no change")
+    for steps in (1, 10, 50):
+        print(f"{steps:>3} steps  ", " ".join(f"{x:6.2f}" for x in relative_error(ensemble, episodes, steps)))
+
+
+if __name__ == "__main__":
+    main()
