@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from metrpo.types import Array, Normaliser, Transitions
 
@@ -52,17 +53,22 @@ def normaliser_of(
     `unseen` state dimensions get scale 0, so that the networks cannot see them.
     """
 
-    def std(x: Array, floor: float = std_floor) -> Array:
-        return jnp.maximum(jnp.std(jnp.asarray(x), axis=0), floor)
+    # In NumPy, for JAX would compile every operation again for every size of the data.
+    def mean(x: Array) -> Array:
+        return jnp.asarray(np.mean(x, axis=0, dtype=np.float64), jnp.float32)
 
-    state_scale = (1 / std(train.states)).at[jnp.array(unseen, int)].set(0.0)
+    def std(x: Array, floor: float = std_floor) -> Array:
+        return np.maximum(np.std(x, axis=0, dtype=np.float64), floor)
+
+    state_scale = 1 / std(train.states)
+    state_scale[list(unseen)] = 0.0
     return Normaliser(
-        state_mean=jnp.mean(jnp.asarray(train.states), axis=0),
-        state_scale=state_scale,
-        action_mean=jnp.mean(jnp.asarray(train.actions), axis=0),
-        action_scale=1 / std(train.actions),
-        delta_mean=jnp.mean(jnp.asarray(train.deltas), axis=0),
-        delta_std=std(train.deltas, delta_std_floor),
+        state_mean=mean(train.states),
+        state_scale=jnp.asarray(state_scale, jnp.float32),
+        action_mean=mean(train.actions),
+        action_scale=jnp.asarray(1 / std(train.actions), jnp.float32),
+        delta_mean=mean(train.deltas),
+        delta_std=jnp.asarray(std(train.deltas, delta_std_floor), jnp.float32),
     )
 
 

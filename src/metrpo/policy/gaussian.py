@@ -63,4 +63,4 @@ def kl(old_means: Array, old_log_std: Array, means: Array, log_std: Array) -> Ar
 
 def reset_std(policy: Policy, initial_std: float) -> Policy:
     """The policy with its standard deviation set back, as at the start of every policy phase."""
-    return policy._replace(log_std=jnp.full_like(policy.log_std, math.log(initial_std)))
+    return policy._replace(log_std=jnp.full(policy.log_std.shape, math.log(initial_std)))
