@@ -215,6 +215,11 @@ def test_a_diverged_member_keeps_its_best_weights():
         ([[30], []], {}, 25),
         ([range(5, 2000, 5), []], {"max_passes": 40}, 40),
         ([[3], []], {"validate_every": 3, "patience": 7}, 12),
+        # 30 minibatches are 10 passes of 3, 31 need a part of the third block, and it is trained whole
+        ([range(5, 2000, 5), []], {"max_steps": 30}, 10),
+        ([range(5, 2000, 5), []], {"max_steps": 31}, 15),
+        ([range(5, 2000, 5), []], {"max_steps": 30, "max_passes": 5}, 5),
+        ([[], []], {"max_steps": 3000}, 25),
     ],
 )
 def test_fitting_stops_when_no_member_has_improved_for_the_patience(monkeypatch, improvements, settings, passes):
