@@ -1,6 +1,6 @@
 """The library in a few lines: train, load, act, judge; and the loop in one's own hands.
 
-    python examples/library.py            # a few minutes
+python examples/library.py            # a few minutes
 """
 
 import numpy as np

@@ -15,12 +15,13 @@ import pytest
 
 import probe
 from helpers import linear_ensemble, random_ensemble, random_policy, slow_mean
-from metrpo import algorithm
+from metrpo import algorithm, phase
 from metrpo.config import Config
 from metrpo.model.imagine import ImagineInfo, imagine
 from metrpo.policy import advantage, gaussian, trpo
 from metrpo.policy.trpo import ImproveInfo
 from metrpo.presets import override, preset
+from metrpo.run import clock as clock_module
 from metrpo.run.progress import SILENT, Progress
 from metrpo.types import Trajectories
 from metrpo.world import task as task_module
@@ -259,7 +260,7 @@ def test_parameter_noise_is_proportional_to_the_change_of_each_parameter():
 
 def test_the_clock_counts_nothing_twice(monkeypatch):
     now = iter([0.0, 10.0, 13.0, 20.0, 24.0, 40.0])
-    monkeypatch.setattr(algorithm.time, "perf_counter", lambda: next(now))
+    monkeypatch.setattr(clock_module.time, "perf_counter", lambda: next(now))
     clock = algorithm.Clock()
     with clock("improve"):  # 0 to 40
         with clock("validate"):  # 10 to 13
@@ -330,8 +331,8 @@ class Script:
 
     def __init__(self, monkeypatch, tiny, values, **settings):
         self.values, self.blocks, self.fixed_starts, self.starts = values, [], [], []
-        monkeypatch.setattr(algorithm, "_updates", self._updates)
-        monkeypatch.setattr(algorithm, "_validate", self._validate)
+        monkeypatch.setattr(phase, "_updates", self._updates)
+        monkeypatch.setattr(phase, "_validate", self._validate)
         self.state = tiny.states[2]._replace(baseline=np.zeros(8, np.float32))
         layers = ((np.zeros((2, 2), np.float32), np.zeros(2, np.float32)),)
         self.state = self.state._replace(policy=gaussian.Policy(layers, np.full(2, -3.0, np.float32)))
@@ -491,7 +492,7 @@ def test_starts_may_be_fresh_resets_instead(tiny, monkeypatch):
 @pytest.mark.parametrize(("steps", "horizon", "rollouts"), [(100, 20, 5), (101, 20, 6), (1, 20, 1), (50_000, 200, 250)])
 def test_enough_rollouts_for_the_imagined_steps(steps, horizon, rollouts):
     task = types.SimpleNamespace(horizon=horizon)
-    assert algorithm._rollouts(override(TINY, {"imagine.steps": steps}), task) == rollouts
+    assert phase.rollouts(override(TINY, {"imagine.steps": steps}), task) == rollouts
 
 
 def test_a_block_of_updates_is_imagination_advantages_and_trpo_one_after_the_other(tiny):
@@ -500,7 +501,7 @@ def test_a_block_of_updates_is_imagination_advantages_and_trpo_one_after_the_oth
     policy = jax.tree.map(jnp.asarray, random_policy(0, 2, 2, hidden=(4,), std=0.5))
     starts = np.random.default_rng(0).uniform(-0.7, 0.7, (5, 5, 2)).astype(np.float32)
     baseline, key = advantage.init_baseline(2) - 0.1, jax.random.key(3)
-    got_policy, got_baseline, (improved, imagined) = algorithm._updates(
+    got_policy, got_baseline, (improved, imagined) = phase._updates(
         probe.PROBE, TINY, ensemble, policy, baseline, starts, key
     )
 

@@ -9,7 +9,28 @@ import time
 import pytest
 
 STAGES = ("collect", "fit", "improve", "evaluate")
-TINY = ["--deterministic", "--iterations", "2", "--collect.steps", "400", "--ensemble.members", "2", "--ensemble.hidden", "16", "16", "--fit.max-steps", "200", "--imagine.steps", "2000", "--validate.max-updates", "10", "--validate.starts", "5", "--evaluation-episodes", "2"]
+TINY = [
+    "--deterministic",
+    "--iterations",
+    "2",
+    "--collect.steps",
+    "400",
+    "--ensemble.members",
+    "2",
+    "--ensemble.hidden",
+    "16",
+    "16",
+    "--fit.max-steps",
+    "200",
+    "--imagine.steps",
+    "2000",
+    "--validate.max-updates",
+    "10",
+    "--validate.starts",
+    "5",
+    "--evaluation-episodes",
+    "2",
+]
 DERIVED = ("metrics.csv", "policy.npz", "policy.json", "config.json", "curve.png", "checkpoints/iteration-00002.npz")
 
 

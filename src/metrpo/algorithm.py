@@ -18,8 +18,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,14 +26,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from metrpo import phase
 from metrpo.config import Config
 from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Ensemble, Networks
 from metrpo.model.fit import FitInfo, fit
-from metrpo.model.imagine import ImagineInfo, imagine, returns_per_model
-from metrpo.policy import advantage, gaussian, trpo
+from metrpo.phase import PhaseInfo
+from metrpo.policy import advantage, gaussian
 from metrpo.policy.gaussian import Policy
-from metrpo.policy.validate import RULES
+from metrpo.run.clock import Clock
 from metrpo.run.directory import RunDirectory
 from metrpo.run.progress import SILENT, Progress
 from metrpo.types import Array
@@ -64,25 +64,6 @@ class State(NamedTuple):
     """Of the ensemble; its normaliser derives from the dataset."""
     baseline: Array
     dataset: Dataset
-
-
-class PhaseInfo(NamedTuple):
-    """What one policy phase did."""
-
-    values: np.ndarray
-    """[K], each model's value of the accepted policy."""
-    updates: int
-    accepted_updates: int
-    """Updates up to the accepted policy."""
-    rejected_steps: int
-    """Updates that the line search rejected."""
-    validations: int
-    fraction_improved: float
-    """Mean over the validations."""
-    kl: float
-    """Mean over the updates."""
-    diverged: float
-    """Share of imagined rollouts, mean over the updates."""
 
 
 def init(config: Config) -> State:
@@ -119,7 +100,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
         ensemble, fitted = _fit(config, task, state.networks, dataset, iteration, progress)
     with clock("improve"):
         progress.stage("improve", config.validate.max_updates)
-        policy, baseline, phase = _improve(config, task, state, dataset, ensemble, iteration, progress, clock)
+        policy, baseline, improved = _improve(config, task, state, dataset, ensemble, iteration, progress, clock)
     with clock("evaluate"):
         progress.stage("evaluate", config.evaluation_episodes)
         seed = int(_rng(config, iteration, EVALUATE).integers(2**31))
@@ -128,13 +109,13 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
         iteration=iteration,
         real_steps=state.real_steps + sum(len(e.rewards) for e in episodes),
         policy=policy,
-        previous_policy=state.policy if phase.accepted_updates else state.previous_policy,
+        previous_policy=state.policy if improved.accepted_updates else state.previous_policy,
         networks=ensemble.networks,
         baseline=baseline,
         dataset=dataset,
     )
     collected = float(np.mean([e.rewards.sum() for e in episodes]))
-    return state, _row(state, returns, collected, fitted, phase, clock)
+    return state, _row(state, returns, collected, fitted, improved, clock)
 
 
 def train(config: Config, run_dir: str | Path | None = None, progress: Progress = SILENT) -> State:
@@ -212,94 +193,20 @@ def _improve(
     progress: Progress,
     clock: Clock,
 ) -> tuple[Policy, Array, PhaseInfo]:
-    """The policy phase: updates in blocks, each validated; returns the last accepted policy."""
-    rule, rng = RULES[config.validate.rule], _rng(config, iteration, IMPROVE)
-    key = _key(config, iteration, IMPROVE)
-    pool = dataset.starts
+    rng, starts = _rng(config, iteration, IMPROVE), dataset.starts
     if config.imagine.start == "reset":
-        pool = real.reset_states(task, max(config.validate.starts, _rollouts(config, task)), rng)
-    fixed_starts = pool[rng.integers(len(pool), size=config.validate.starts)]
-    policy, baseline = gaussian.reset_std(state.policy, config.policy.initial_std), state.baseline
-    accepted, reference = policy, np.asarray(_validate(task, ensemble, policy, fixed_starts))
-    updates = accepted_at = 0
-    infos: list[tuple[trpo.ImproveInfo, ImagineInfo]] = []
-    fractions: list[float] = []
-    while updates - accepted_at < config.validate.patience and updates < config.validate.max_updates:
-        block = min(config.validate.every, config.validate.max_updates - updates)
-        starts = pool[rng.integers(len(pool), size=(block, _rollouts(config, task)))]
-        policy, baseline, info = _updates(
-            task, config, ensemble, policy, baseline, starts, jax.random.fold_in(key, updates)
-        )
-        infos.append(jax.device_get(info))
-        updates += block
-        with clock("validate"):
-            values = np.asarray(_validate(task, ensemble, policy, fixed_starts))
-        verdict = rule(values, reference, config.validate)
-        fractions.append(verdict.fraction_improved)
-        if verdict.accepted:
-            accepted, reference, accepted_at = policy, values, updates
-        progress.update(updates, f"accepted {accepted_at}, imagined return {np.mean(reference):.2f}")
-    improve_info, imagine_info = jax.tree.map(lambda *xs: np.concatenate(xs), *infos)
-    return (
-        accepted,
-        baseline,
-        PhaseInfo(
-            values=reference,
-            updates=updates,
-            accepted_updates=accepted_at,
-            rejected_steps=int(np.sum(~improve_info.accepted)),
-            validations=len(fractions),
-            fraction_improved=float(np.mean(fractions)),
-            kl=float(np.mean(improve_info.kl)),
-            diverged=float(np.mean(imagine_info.diverged)),
-        ),
-    )
-
-
-@partial(jax.jit, static_argnames=("task", "config"))
-def _compiled_updates(
-    task: Task, config: Config, ensemble: Ensemble, policy: Policy, baseline: Array, starts: Array, keys: Array
-) -> tuple[Policy, Array, tuple[trpo.ImproveInfo, ImagineInfo]]:
-    """Policy updates in one compiled call, one for each batch of start states [updates, N, S]."""
-
-    def update(
-        carry: tuple[Policy, Array], given: tuple[Array, Array]
-    ) -> tuple[tuple[Policy, Array], tuple[trpo.ImproveInfo, ImagineInfo]]:
-        (policy, baseline), (starts, key) = carry, given
-        rollouts, imagined = imagine(
-            ensemble,
-            partial(gaussian.sample, policy),
-            task.reward,
-            task.terminated,
-            starts,
-            task.horizon,
-            key,
-            config.imagine.sampling,
-        )
-        a = config.advantage
-        advantages, baseline = advantage.advantages_and_baseline(rollouts, baseline, a.discount, a.gae_lambda, a.ridge)
-        batch = trpo.Batch(
-            *(x.reshape(-1, *x.shape[2:]) for x in (rollouts.states, rollouts.actions, advantages, rollouts.mask))
-        )
-        policy, improved = trpo.improve(policy, batch, config.trpo)
-        return (policy, baseline), (improved, imagined)
-
-    (policy, baseline), infos = jax.lax.scan(update, (policy, baseline), (starts, keys))
-    return policy, baseline, infos
-
-
-def _updates(
-    task: Task, config: Config, ensemble: Ensemble, policy: Policy, baseline: Array, starts: np.ndarray, key: Array
-) -> tuple[Policy, Array, tuple[trpo.ImproveInfo, ImagineInfo]]:
-    # What cannot change the compiled code (seed, budget, ...) must not cause a compilation: it is set to a constant.
-    relevant = Config(task=task.name, imagine=config.imagine, advantage=config.advantage, trpo=config.trpo)
-    return _compiled_updates(task, relevant, ensemble, policy, baseline, starts, jax.random.split(key, len(starts)))
-
-
-@partial(jax.jit, static_argnames="task")
-def _validate(task: Task, ensemble: Ensemble, policy: Policy, starts: Array) -> Array:
-    return returns_per_model(
-        ensemble, partial(gaussian.mean, policy), task.reward, task.terminated, starts, task.horizon
+        starts = real.reset_states(task, max(config.validate.starts, phase.rollouts(config, task)), rng)
+    return phase.improve(
+        config,
+        task,
+        ensemble,
+        gaussian.reset_std(state.policy, config.policy.initial_std),
+        state.baseline,
+        starts,
+        rng,
+        _key(config, iteration, IMPROVE),
+        clock,
+        lambda updates, accepted, value: progress.update(updates, f"accepted {accepted}, imagined return {value:.2f}"),
     )
 
 
@@ -313,8 +220,10 @@ def _perturbed(policy: Policy, previous: Policy, scale: float, rng: np.random.Ge
     return partial(gaussian.mean, perturbed)
 
 
-def _row(state: State, returns: np.ndarray, collected: float, fitted: FitInfo, phase: PhaseInfo, clock: Clock) -> Row:
-    imagined = float(np.mean(phase.values))
+def _row(
+    state: State, returns: np.ndarray, collected: float, fitted: FitInfo, improved: PhaseInfo, clock: Clock
+) -> Row:
+    imagined = float(np.mean(improved.values))
     losses = np.asarray(fitted.validation_loss)
     return {
         "iteration": state.iteration,
@@ -327,40 +236,16 @@ def _row(state: State, returns: np.ndarray, collected: float, fitted: FitInfo, p
         **{f"validation_loss_{k}": float(loss) for k, loss in enumerate(losses)},
         "train_loss": float(np.mean(fitted.train_loss)),
         "fit_passes": fitted.passes,
-        "updates": phase.updates,
-        "accepted_updates": phase.accepted_updates,
-        "rejected_steps": phase.rejected_steps,
-        "validations": phase.validations,
-        "fraction_improved": phase.fraction_improved,
-        "kl": phase.kl,
+        "updates": improved.updates,
+        "accepted_updates": improved.accepted_updates,
+        "rejected_steps": improved.rejected_steps,
+        "validations": improved.validations,
+        "fraction_improved": improved.fraction_improved,
+        "kl": improved.kl,
         "mean_std": float(np.mean(np.exp(np.asarray(state.policy.log_std)))),
-        "diverged": phase.diverged,
+        "diverged": improved.diverged,
         **clock.row(),
     }
-
-
-class Clock:
-    """Seconds per stage; a stage inside another (validate in improve) is not counted twice."""
-
-    def __init__(self) -> None:
-        self.seconds = dict.fromkeys(("collect", "fit", "improve", "validate", "evaluate"), 0.0)
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Counts what happens inside the block towards `stage`."""
-        start, counted = time.perf_counter(), sum(self.seconds.values())
-        yield
-        inner = sum(self.seconds.values()) - counted
-        self.seconds[stage] += time.perf_counter() - start - inner
-
-    def row(self) -> Row:
-        """The metrics' columns."""
-        return {f"seconds_{stage}": seconds for stage, seconds in self.seconds.items()}
-
-
-def _rollouts(config: Config, task: Task) -> int:
-    """Imagined episodes per update: enough for `imagine.steps` steps."""
-    return -(-config.imagine.steps // task.horizon)
 
 
 def _fresh_networks(config: Config, task: Task, key: Array) -> Networks:
