@@ -1,0 +1,34 @@
+"""What the README claims is what the committed runs show."""
+
+import json
+import runpy
+from pathlib import Path
+
+import pytest
+
+from metrpo import read_metrics
+
+ROOT = Path(__file__).resolve().parents[1]
+RUNS = sorted(path.parent for path in (ROOT / "results").glob("*/*/*/seed-*/metrics.csv"))
+
+
+def test_there_are_results():
+    assert len(RUNS) >= 3
+
+
+@pytest.mark.parametrize("run", RUNS, ids=lambda run: str(run.relative_to(ROOT / "results")))
+def test_a_result_is_whole(run):
+    config = json.loads((run / "config.json").read_text())
+    about = json.loads((run / "run.json").read_text())
+    rows = read_metrics(run / "metrics.csv")
+    assert config["task"] == run.parent.parent.name
+    assert f"seed-{config['seed']}" == run.name
+    assert len(about["commit"]) == 40, "run from a clean commit"
+    assert (run / "curve.png").stat().st_size > 0
+    assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
+
+
+def test_the_readmes_table_is_the_one_that_the_metrics_give():
+    summarise = runpy.run_path(str(ROOT / "benchmarks" / "summarise.py"))
+    table = summarise["table"]([ROOT / "results"])
+    assert table in (ROOT / "README.md").read_text(), "run: python benchmarks/summarise.py, and put the table in"
