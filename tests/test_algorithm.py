@@ -572,7 +572,7 @@ def test_the_whole_loop_finds_the_optimum_of_the_probe():
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_swimmer_learns_to_swim():
-    """Four iterations of the fast preset; an untrained swimmer earns about 0."""
+    """Four iterations of the fast preset; an untrained swimmer earns about 0, seeds 0, 1 and 2 earned 35, 34 and 23."""
     returns = []
 
     class Returns(Progress):
@@ -581,4 +581,4 @@ def test_swimmer_learns_to_swim():
 
     algorithm.train(preset("Swimmer", iterations=4), progress=Returns())
     assert len(returns) == 4
-    assert max(returns[-2:]) > 5
+    assert max(returns[-2:]) > 15
