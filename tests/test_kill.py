@@ -8,6 +8,9 @@ import time
 
 import pytest
 
+# Seconds on a free core; a machine that does other work needs longer.
+pytestmark = pytest.mark.timeout(600)
+
 STAGES = ("collect", "fit", "improve", "evaluate")
 TINY = [
     "--deterministic",
@@ -45,7 +48,7 @@ def start(run_dir):
 
 def run_to_the_end(run_dir):
     process = start(run_dir)
-    process.communicate(timeout=100)
+    process.communicate(timeout=300)
     assert process.returncode == 0
 
 

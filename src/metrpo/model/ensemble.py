@@ -55,10 +55,10 @@ def normaliser_of(
 
     # In NumPy, for JAX would compile every operation again for every size of the data.
     def mean(x: Array) -> Array:
-        return jnp.asarray(np.mean(x, axis=0, dtype=np.float64), jnp.float32)
+        return jnp.asarray(np.mean(np.asarray(x), axis=0, dtype=np.float64), jnp.float32)
 
     def std(x: Array, floor: float = std_floor) -> Array:
-        return np.maximum(np.std(x, axis=0, dtype=np.float64), floor)
+        return np.maximum(np.std(np.asarray(x), axis=0, dtype=np.float64), floor)
 
     state_scale = 1 / std(train.states)
     state_scale[list(unseen)] = 0.0
