@@ -320,7 +320,8 @@ def test_no_gpu_is_one_message(capsys, monkeypatch):
 
 
 STOPPED = """
-import sys, time, types
+import signal, sys, time, types
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what runs in its background
 stub = types.ModuleType("metrpo.algorithm")
 def train(config, run_dir, progress):
     progress.begin(1, 2)
