@@ -61,6 +61,5 @@ def with_capacity(transitions: Transitions, capacity: int) -> Transitions:
 def _append(old: Transitions, episodes: list[Episode], most: int) -> Transitions:
     states = np.concatenate([old.states, *(e.states[:-1] for e in episodes)])[-most:]
     actions = np.concatenate([old.actions, *(e.actions for e in episodes)])[-most:]
-    # In float64, else the small change of a large state loses digits.
-    deltas = [np.diff(e.states.astype(np.float64), axis=0).astype(np.float32) for e in episodes]
+    deltas = [np.diff(e.states, axis=0) for e in episodes]
     return Transitions(states, actions, np.concatenate([old.deltas, *deltas])[-most:], len(states))
