@@ -141,7 +141,7 @@ def _loop(config: Config, state: State, progress: Progress, save: Callable[[Stat
             progress.begin(state.iteration + 1, None if left is None else state.iteration + left)
             state, row = step(config, state, progress)
             written = save(state, row)
-            # The first iteration compiles: the second is the better guess as soon as there is one.
+            # Of the last three: iterations grow with the data, and the first one compiled.
             seconds = [*seconds, time.monotonic() - started][-3:]
             left = _iterations_left(config, state)
             progress.end(written, None if left is None else left * float(np.mean(seconds)))
