@@ -23,7 +23,6 @@ from metrpo.policy.trpo import ImproveInfo
 from metrpo.presets import override, preset
 from metrpo.run import clock as clock_module
 from metrpo.run.progress import SILENT, Progress
-from metrpo.types import Trajectories
 from metrpo.world import task as task_module
 
 TINY = override(
@@ -499,7 +498,7 @@ def test_a_block_of_updates_is_imagination_advantages_and_trpo_one_after_the_oth
     """Each update imagines with the policy of the one before, and is judged by the baseline of the one before."""
     ensemble = linear_ensemble([(probe.A, probe.B), (0.9 * probe.A, probe.B)])
     policy = jax.tree.map(jnp.asarray, random_policy(0, 2, 2, hidden=(4,), std=0.5))
-    starts = np.random.default_rng(0).uniform(-0.7, 0.7, (5, 5, 2)).astype(np.float32)
+    starts = np.random.default_rng(0).uniform(-0.7, 0.7, (2, 5, 2)).astype(np.float32)
     baseline, key = advantage.init_baseline(2) - 0.1, jax.random.key(3)
     got_policy, got_baseline, (improved, imagined) = phase._updates(
         probe.PROBE, TINY, ensemble, policy, baseline, starts, key
@@ -510,17 +509,18 @@ def test_a_block_of_updates_is_imagination_advantages_and_trpo_one_after_the_oth
         act = partial(gaussian.sample, policy)
         t, info = imagine(ensemble, act, probe.reward, None, starts, probe.HORIZON, key)
         advantages, baseline = advantage.advantages_and_baseline(t, baseline, 1.0, 1.0, 1e-5)
-        flat = Trajectories(*(x.reshape(100, *x.shape[2:]) for x in t))
-        batch = trpo.Batch(flat.states, flat.actions, advantages.reshape(100), flat.mask)
+        batch = trpo.Batch(t.states, t.actions, advantages, t.mask)
+        batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(100, *x.shape[2:]), batch)
         policy, improve_info = trpo.improve(policy, batch, TINY.trpo)
         return policy, baseline, improve_info, info, advantage.features(t.states)
 
-    for i, k in enumerate(jax.random.split(key, 5)):
-        policy, baseline, improve_info, info, feature = one(policy, baseline, starts[i], k)
+    for i, k in enumerate(jax.random.split(key, 2)):
+        mine = jax.random.fold_in(k, 0)  # the first device's
+        policy, baseline, improve_info, info, feature = one(policy, baseline, starts[i], mine)
         assert float(improved.kl[i]) == pytest.approx(float(improve_info.kl), rel=0.02)
         assert float(imagined.mean_return[i]) == pytest.approx(float(info.mean_return), rel=1e-3)
     for ours, theirs in zip(jax.tree.leaves(got_policy), jax.tree.leaves(policy), strict=True):
-        np.testing.assert_allclose(ours, theirs, atol=5e-3)
+        np.testing.assert_allclose(ours, theirs, atol=2e-3)
     # t, t^2, t^3 are nearly collinear: the values tell, not the weights.
     np.testing.assert_allclose(feature @ got_baseline, feature @ baseline, atol=0.1)
 

@@ -6,12 +6,13 @@ import dataclasses
 import json
 import types
 import typing
+from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from metrpo.config import BUDGET_FIELDS, Config, difference, flatten, from_json, to_json
+from metrpo.config import ADDED, BUDGET_FIELDS, Config, difference, flatten, from_json, to_json
 from metrpo.errors import ConfigError
 from metrpo.presets import override
 
@@ -120,6 +121,7 @@ IMPOSSIBLE = {
     "advantage.ridge": [0.0, -1.0],
     "trpo.max_kl": [0.0, -0.01, float("nan")],
     "trpo.cg_iterations": [0],
+    "trpo.fisher_every": [0],
     "trpo.damping": [-1e-5, float("nan")],
     "trpo.backtrack_ratio": [0.0, 1.0, 1.5, float("nan")],
     "trpo.max_backtracks": [0],
@@ -275,3 +277,11 @@ def test_override_refuses_an_unknown_setting(name):
 def test_override_refuses_a_value_of_the_wrong_kind(name, value):
     with pytest.raises(ConfigError, match=rf"{name}: expected"):
         override(Config(task="x"), {name: value})
+
+
+def test_a_setting_newer_than_a_file_has_its_default_and_no_other_may_be_missing():
+    added = {"__".join(name.split(".")[1:]): ... for name in ADDED}
+    assert from_json(edited(**added)) == from_json(edited())
+    committed = sorted((Path(__file__).parents[1] / "results").glob("*/*/*/seed-*/config.json"))
+    assert committed
+    assert [path for path in committed if from_json(path.read_text()).task not in path.parts] == []

@@ -164,6 +164,8 @@ class TRPOConfig:
     """Trust region: the largest mean KL divergence from the old to the new policy."""
     cg_iterations: int = 10
     """Conjugate-gradient iterations."""
+    fisher_every: int = 1
+    """Average the Fisher matrix over every n-th step of the batch only (Schulman et al. 2015, appendix C)."""
     damping: float = 1e-5
     """Added to the Fisher matrix's diagonal."""
     backtrack_ratio: float = 0.8
@@ -174,6 +176,7 @@ class TRPOConfig:
     def __post_init__(self) -> None:
         _require(_positive(self.max_kl), "trpo.max_kl", self.max_kl, "a finite number > 0")
         _require(self.cg_iterations >= 1, "trpo.cg_iterations", self.cg_iterations, "at least 1")
+        _require(self.fisher_every >= 1, "trpo.fisher_every", self.fisher_every, "at least 1")
         _require(_nonnegative(self.damping), "trpo.damping", self.damping, "a finite number >= 0")
         _require(
             0 < self.backtrack_ratio < 1, "trpo.backtrack_ratio", self.backtrack_ratio, "between 0 and 1, both excluded"
@@ -244,6 +247,9 @@ class Config:
 BUDGET_FIELDS = ("iterations", "real_steps")
 """Fields that say how long to run, not what is run: they may change when a run is resumed."""
 
+ADDED = ("config.trpo.fisher_every",)
+"""Settings newer than the first config.json files: where one is missing, its default is what was done then."""
+
 
 def to_json(config: Config) -> str:
     """The config as JSON text, one setting a line."""
@@ -298,10 +304,11 @@ def _build(cls: type, data: object, where: str) -> Any:
         raise ConfigError(f"{where}: expected an object with its settings, got {data!r}")
     hints = typing.get_type_hints(cls)
     names = [f.name for f in dataclasses.fields(cls)]
-    wrong = [f"missing {n}" for n in names if n not in data] + [f"unknown {n}" for n in data if n not in names]
+    missing = [n for n in names if n not in data and f"{where}.{n}" not in ADDED]
+    wrong = [f"missing {n}" for n in missing] + [f"unknown {n}" for n in data if n not in names]
     if wrong:
         raise ConfigError(f"{where}: expected exactly the settings of this version, got {', '.join(wrong)}")
-    return cls(**{name: convert(hints[name], data[name], f"{where}.{name}") for name in names})
+    return cls(**{name: convert(hints[name], data[name], f"{where}.{name}") for name in names if name in data})
 
 
 def convert(kind: Any, value: Any, where: str) -> Any:

@@ -11,8 +11,11 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, PartitionSpec
 
+from metrpo import devices
 from metrpo.config import Config
 from metrpo.model.ensemble import Ensemble
 from metrpo.model.imagine import ImagineInfo, imagine, returns_per_model
@@ -21,6 +24,9 @@ from metrpo.policy.gaussian import Policy
 from metrpo.policy.validate import RULES
 from metrpo.types import Array
 from metrpo.world.task import Task
+
+AXIS = "rollouts"
+"""Imagined rollouts are what devices share."""
 
 
 class PhaseInfo(NamedTuple):
@@ -61,7 +67,7 @@ def improve(
     """
     rule = RULES[config.validate.rule]
     fixed_starts = pool[rng.integers(len(pool), size=config.validate.starts)]
-    accepted, reference = policy, np.asarray(_validate(task, ensemble, policy, fixed_starts))
+    accepted, reference = policy, _validate(task, ensemble, policy, fixed_starts)
     updates = accepted_at = 0
     infos: list[tuple[trpo.ImproveInfo, ImagineInfo]] = []
     fractions: list[float] = []
@@ -74,7 +80,7 @@ def improve(
         infos.append(jax.device_get(info))
         updates += block
         with clock("validate"):
-            values = np.asarray(_validate(task, ensemble, policy, fixed_starts))
+            values = _validate(task, ensemble, policy, fixed_starts)
         verdict = rule(values, reference, config.validate)
         fractions.append(verdict.fraction_improved)
         if verdict.accepted:
@@ -102,36 +108,58 @@ def rollouts(config: Config, task: Task) -> int:
     return -(-config.imagine.steps // task.horizon)
 
 
-@partial(jax.jit, static_argnames=("task", "config"))
+@partial(jax.jit, static_argnames=("task", "config", "mesh"))
 def _compiled_updates(
-    task: Task, config: Config, ensemble: Ensemble, policy: Policy, baseline: Array, starts: Array, keys: Array
+    task: Task,
+    config: Config,
+    mesh: Mesh,
+    ensemble: Ensemble,
+    policy: Policy,
+    baseline: Array,
+    starts: Array,
+    keys: Array,
 ) -> tuple[Policy, Array, tuple[trpo.ImproveInfo, ImagineInfo]]:
-    """Policy updates in one compiled call, one for each batch of start states [updates, N, S]."""
+    """Policy updates in one compiled call, one for each batch of start states [updates, N, S], shared by `mesh`."""
 
-    def update(
-        carry: tuple[Policy, Array], given: tuple[Array, Array]
-    ) -> tuple[tuple[Policy, Array], tuple[trpo.ImproveInfo, ImagineInfo]]:
-        (policy, baseline), (starts, key) = carry, given
-        rollouts, imagined = imagine(
-            ensemble,
-            partial(gaussian.sample, policy),
-            task.reward,
-            task.terminated,
-            starts,
-            task.horizon,
-            key,
-            config.imagine.sampling,
-        )
-        a = config.advantage
-        advantages, baseline = advantage.advantages_and_baseline(rollouts, baseline, a.discount, a.gae_lambda, a.ridge)
-        batch = trpo.Batch(
-            *(x.reshape(-1, *x.shape[2:]) for x in (rollouts.states, rollouts.actions, advantages, rollouts.mask))
-        )
-        policy, improved = trpo.improve(policy, batch, config.trpo)
-        return (policy, baseline), (improved, imagined)
+    def updates(
+        ensemble: Ensemble, policy: Policy, baseline: Array, starts: Array, keys: Array
+    ) -> tuple[Policy, Array, tuple[trpo.ImproveInfo, ImagineInfo]]:
+        def update(
+            carry: tuple[Policy, Array], given: tuple[Array, Array]
+        ) -> tuple[tuple[Policy, Array], tuple[trpo.ImproveInfo, ImagineInfo]]:
+            (policy, baseline), (starts, key) = carry, given
+            rollouts, imagined = imagine(
+                ensemble,
+                partial(gaussian.sample, policy),
+                task.reward,
+                task.terminated,
+                starts,
+                task.horizon,
+                key,
+                config.imagine.sampling,
+                AXIS,
+            )
+            a = config.advantage
+            advantages, baseline = advantage.advantages_and_baseline(
+                rollouts, baseline, a.discount, a.gae_lambda, a.ridge, AXIS
+            )
+            batch = trpo.Batch(rollouts.states, rollouts.actions, advantages, rollouts.mask)
+            # Episode by episode: every n-th step is then one of every episode, whatever their number.
+            batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), batch)
+            policy, improved = trpo.improve(policy, batch, config.trpo, AXIS)
+            return (policy, baseline), (improved, imagined)
 
-    (policy, baseline), infos = jax.lax.scan(update, (policy, baseline), (starts, keys))
-    return policy, baseline, infos
+        (policy, baseline), infos = jax.lax.scan(update, (policy, baseline), (starts, keys))
+        return policy, baseline, infos
+
+    same = PartitionSpec()
+    return jax.shard_map(
+        updates,
+        mesh=mesh,
+        in_specs=(same, same, same, PartitionSpec(None, AXIS), same),
+        out_specs=same,
+        check_vma=False,
+    )(ensemble, policy, baseline, starts, keys)
 
 
 def _updates(
@@ -139,11 +167,26 @@ def _updates(
 ) -> tuple[Policy, Array, tuple[trpo.ImproveInfo, ImagineInfo]]:
     # What cannot change the compiled code (seed, budget, ...) must not cause a compilation: it is set to a constant.
     relevant = Config(task=task.name, imagine=config.imagine, advantage=config.advantage, trpo=config.trpo)
-    return _compiled_updates(task, relevant, ensemble, policy, baseline, starts, jax.random.split(key, len(starts)))
+    mesh, keys = devices.mesh(starts.shape[1], AXIS), jax.random.split(key, len(starts))
+    ensemble, policy, baseline = devices.copied((ensemble, policy, baseline), mesh)
+    return _compiled_updates(task, relevant, mesh, ensemble, policy, baseline, starts, keys)
 
 
-@partial(jax.jit, static_argnames="task")
-def _validate(task: Task, ensemble: Ensemble, policy: Policy, starts: Array) -> Array:
-    return returns_per_model(
-        ensemble, partial(gaussian.mean, policy), task.reward, task.terminated, starts, task.horizon
-    )
+@partial(jax.jit, static_argnames=("task", "mesh"))
+def _compiled_validate(task: Task, mesh: Mesh, ensemble: Ensemble, policy: Policy, starts: Array) -> Array:
+    def values(ensemble: Ensemble, policy: Policy, starts: Array) -> Array:
+        mine = returns_per_model(
+            ensemble, partial(gaussian.mean, policy), task.reward, task.terminated, starts, task.horizon
+        )
+        return jax.lax.pmean(mine, AXIS)
+
+    same = PartitionSpec()
+    return jax.shard_map(
+        values, mesh=mesh, in_specs=(same, same, PartitionSpec(AXIS)), out_specs=same, check_vma=False
+    )(ensemble, policy, starts)
+
+
+def _validate(task: Task, ensemble: Ensemble, policy: Policy, starts: np.ndarray) -> np.ndarray:
+    mesh = devices.mesh(len(starts), AXIS)
+    ensemble, policy = devices.copied((ensemble, policy), mesh)
+    return np.asarray(_compiled_validate(task, mesh, ensemble, policy, starts))

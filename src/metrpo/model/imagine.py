@@ -12,6 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from metrpo.devices import across, share_of
 from metrpo.model.ensemble import Ensemble, predict
 from metrpo.types import Array, Trajectories
 
@@ -72,10 +73,12 @@ def imagine(
     horizon: int,
     key: Array,
     sampling: str = "step_rand",
+    axis: str | None = None,
 ) -> tuple[Trajectories, ImagineInfo]:
     """Imagined episodes of `horizon` steps from `starts` [N, S].
 
-    Actions are clipped to [-1, 1] for dynamics and reward, and recorded as drawn.
+    Actions are clipped to [-1, 1] for dynamics and reward, and recorded as drawn. With `axis`, `starts` are this
+    device's share of the batch; the trajectories stay with it, the info is about all (see `metrpo.devices`).
     """
     next_state = SAMPLINGS[sampling]
 
@@ -96,11 +99,14 @@ def imagine(
         return (following, alive, diverged), recorded
 
     count = starts.shape[0]
+    key = share_of(key, axis)
     carry = (starts, jnp.ones(count), jnp.zeros(count, bool))
     (_, _, diverged), trajectories = jax.lax.scan(step, carry, jax.random.split(key, horizon))
     mask = trajectories.mask * (1.0 - diverged)
-    returns = jnp.sum(trajectories.rewards * mask, axis=0)
-    info = ImagineInfo(jnp.sum(returns) / jnp.maximum(jnp.sum(~diverged), 1), jnp.mean(diverged), jnp.sum(mask))
+    total, lost, rollouts, steps = across(
+        (jnp.sum(trajectories.rewards * mask), jnp.sum(diverged), jnp.float32(count), jnp.sum(mask)), axis
+    )
+    info = ImagineInfo(total / jnp.maximum(rollouts - lost, 1), lost / rollouts, steps)
     return trajectories._replace(mask=mask), info
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from metrpo.devices import across
 from metrpo.types import Array, Trajectories
 
 
@@ -21,17 +22,18 @@ def init_baseline(state_size: int) -> Array:
     return jnp.zeros(2 * state_size + 4)
 
 
-def fit_baseline(feature: Array, targets: Array, mask: Array, ridge: float) -> Array:
+def fit_baseline(feature: Array, targets: Array, mask: Array, ridge: float, axis: str | None = None) -> Array:
     """Ridge regression of `targets` [T, N] on `feature` [T, N, F] where `mask` [T, N] is 1: weights [F].
 
     Solved by the normal equations in the columns' own scale, which float32 needs: squares reach 100 and counts 50,000.
     """
     x = (feature * mask[..., None]).reshape(-1, feature.shape[-1])
-    gram = x.T @ x + ridge * jnp.eye(x.shape[1])
+    gram = across(x.T @ x, axis) + ridge * jnp.eye(x.shape[1])
     scale = jax.lax.rsqrt(jnp.diag(gram))
     # Constant or repeated columns are exactly collinear; the jitter is float32's resolution, below any real signal.
     scaled = gram * scale * scale[:, None] + 1e-6 * jnp.eye(x.shape[1])
-    weights = scale * jax.scipy.linalg.solve(scaled, scale * (x.T @ (targets * mask).reshape(-1)), assume_a="pos")
+    target = across(x.T @ (targets * mask).reshape(-1), axis)
+    weights = scale * jax.scipy.linalg.solve(scaled, scale * target, assume_a="pos")
     return jnp.where(jnp.all(jnp.isfinite(weights)), weights, 0.0)
 
 
@@ -56,21 +58,29 @@ def gae(rewards: Array, values: Array, mask: Array, discount: float, gae_lambda:
     return discounted_returns(errors, mask, discount * gae_lambda)
 
 
-def standardise(advantages: Array, mask: Array) -> Array:
+def standardise(advantages: Array, mask: Array, axis: str | None = None) -> Array:
     """Advantages with mean 0 and standard deviation 1 where `mask` is 1, and 0 elsewhere."""
-    count = jnp.maximum(jnp.sum(mask), 1.0)
-    mean = jnp.sum(advantages * mask) / count
-    variance = jnp.sum(jnp.square(advantages - mean) * mask) / count
+    count = jnp.maximum(across(jnp.sum(mask), axis), 1.0)
+    mean = across(jnp.sum(advantages * mask), axis) / count
+    variance = across(jnp.sum(jnp.square(advantages - mean) * mask), axis) / count
     return mask * (advantages - mean) / (jnp.sqrt(variance) + 1e-8)
 
 
 def advantages_and_baseline(
-    trajectories: Trajectories, baseline: Array, discount: float, gae_lambda: float, ridge: float
+    trajectories: Trajectories,
+    baseline: Array,
+    discount: float,
+    gae_lambda: float,
+    ridge: float,
+    axis: str | None = None,
 ) -> tuple[Array, Array]:
-    """Standardised advantages [T, N] under `baseline`, and the baseline refitted to this batch for the next one."""
+    """Standardised advantages [T, N] under `baseline`, and the baseline refitted to this batch for the next one.
+
+    With `axis`, the trajectories are this device's share of the batch (see `metrpo.devices`).
+    """
     feature = features(trajectories.states)
     values = feature @ baseline
     advantages = gae(trajectories.rewards, values, trajectories.mask, discount, gae_lambda)
     returns = discounted_returns(trajectories.rewards, trajectories.mask, discount)
-    refitted = fit_baseline(feature, returns, trajectories.mask, ridge)
-    return standardise(advantages, trajectories.mask), refitted
+    refitted = fit_baseline(feature, returns, trajectories.mask, ridge, axis)
+    return standardise(advantages, trajectories.mask, axis), refitted

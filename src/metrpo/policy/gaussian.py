@@ -48,17 +48,17 @@ def sample(policy: Policy, states: Array, key: Array) -> Array:
     return means + jnp.exp(policy.log_std) * jax.random.normal(key, means.shape)
 
 
-def log_probability(means: Array, log_std: Array, actions: Array) -> Array:
-    """log pi(a | s) of `actions` [..., A] under N(means, exp(log_std)^2): [...]."""
+def log_probability(means: Array, log_std: Array, actions: Array, axis: int = -1) -> Array:
+    """log pi(a | s) of `actions` [..., A] under N(means, exp(log_std)^2): [...]; the actions lie along `axis`."""
     z = (actions - means) * jnp.exp(-log_std)
-    return -0.5 * jnp.sum(jnp.square(z) + 2 * log_std + math.log(2 * math.pi), axis=-1)
+    return -0.5 * jnp.sum(jnp.square(z) + 2 * log_std + math.log(2 * math.pi), axis=axis)
 
 
-def kl(old_means: Array, old_log_std: Array, means: Array, log_std: Array) -> Array:
-    """KL(old || new) in every state: [..., A] -> [...]."""
+def kl(old_means: Array, old_log_std: Array, means: Array, log_std: Array, axis: int = -1) -> Array:
+    """KL(old || new) in every state: [..., A] -> [...]; the actions lie along `axis`."""
     ratio = jnp.exp(2 * (old_log_std - log_std))
     distance = jnp.square((old_means - means) * jnp.exp(-log_std))
-    return 0.5 * jnp.sum(ratio + distance - 1.0 + 2 * (log_std - old_log_std), axis=-1)
+    return 0.5 * jnp.sum(ratio + distance - 1.0 + 2 * (log_std - old_log_std), axis=axis)
 
 
 def reset_std(policy: Policy, initial_std: float) -> Policy:

@@ -10,8 +10,10 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from metrpo.config import TRPOConfig
+from metrpo.devices import across
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
+from metrpo.policy.linearised import Linearised, chunked, forward, gauss_newton, linearise, pull_back
 from metrpo.types import Array
 
 
@@ -43,28 +45,53 @@ class ImproveInfo(NamedTuple):
     """|F x - g| / |g| after the last conjugate-gradient iteration."""
 
 
-def improve(policy: Policy, batch: Batch, config: TRPOConfig) -> tuple[Policy, ImproveInfo]:
-    """One TRPO update on `batch`; the policy stays as it is when no step of the line search improves within max_kl."""
-    count = jnp.maximum(jnp.sum(batch.mask), 1.0)
-    old_means = gaussian.mean(policy, batch.states)
-    old_log_probability = gaussian.log_probability(old_means, policy.log_std, batch.actions)
-    flat, unravel = ravel_pytree(policy)
+def improve(policy: Policy, batch: Batch, config: TRPOConfig, axis: str | None = None) -> tuple[Policy, ImproveInfo]:
+    """One TRPO update on `batch`; the policy stays as it is when no step of the line search improves within max_kl.
+
+    With `axis`, `batch` is this device's share of the batch (see `metrpo.devices`).
+    """
+    states, actions, advantages, mask = (chunked(x) for x in batch)
+    count = jnp.maximum(across(jnp.sum(mask), axis), 1.0)
+    weights = mask * advantages / count
+    old_log_std = policy.log_std[:, None]
+    at = linearise(policy.layers, states)
 
     def surrogate_and_kl(new: Policy) -> tuple[Array, Array]:
-        means = gaussian.mean(new, batch.states)
-        ratio = jnp.exp(gaussian.log_probability(means, new.log_std, batch.actions) - old_log_probability)
-        divergence = gaussian.kl(old_means, policy.log_std, means, new.log_std)
-        return jnp.sum(batch.mask * ratio * batch.advantages) / count, jnp.sum(batch.mask * divergence) / count
+        log_std = new.log_std[:, None]
 
-    gradient = ravel_pytree(jax.grad(lambda p: surrogate_and_kl(p)[0])(policy))[0]
-    product = fisher_product(policy, batch.states, batch.mask, config.damping)
+        def add(total: tuple[Array, Array], chunk: tuple[Array, ...]) -> tuple[tuple[Array, Array], None]:
+            states, actions, old_means, weights, mask = chunk
+            means = forward(new.layers, states)[-1]
+            log_ratio = gaussian.log_probability(means, log_std, actions, 0) - gaussian.log_probability(
+                old_means, old_log_std, actions, 0
+            )
+            divergence = gaussian.kl(old_means, old_log_std, means, log_std, 0)
+            return (total[0] + jnp.sum(weights * jnp.exp(log_ratio)), total[1] + jnp.sum(mask * divergence)), None
+
+        zero = (jnp.float32(0), jnp.float32(0))
+        surrogate, divergence = across(jax.lax.scan(add, zero, (states, actions, at.means, weights, mask))[0], axis)
+        return surrogate, divergence / count
+
+    # The surrogate's gradient at the old policy, where every ratio is 1.
+    z = (actions - at.means) * jnp.exp(-old_log_std)
+    slope = Policy(
+        pull_back(at, weights * z * jnp.exp(-old_log_std)), jnp.sum(weights * (jnp.square(z) - 1.0), axis=(0, 2))
+    )
+    flat, unravel = ravel_pytree(policy)
+    gradient = ravel_pytree(across(slope, axis))[0]
+    every = config.fisher_every
+    sample = (at, mask)
+    if every > 1:
+        fewer = chunked(batch.mask[::every])
+        sample = (linearise(policy.layers, chunked(batch.states[::every])), fewer)
+    product = fisher_product(policy, *sample, config.damping, axis)
     direction, residual = conjugate_gradient(
         lambda v: ravel_pytree(product(unravel(v)))[0], gradient, config.cg_iterations
     )
     # F x = g - residual, so x'Fx needs no further product.
     curvature = jnp.dot(direction, gradient - residual)
     step = direction * jnp.sqrt(2 * config.max_kl / jnp.maximum(curvature, 1e-12))
-    start = surrogate_and_kl(policy)[0]
+    start = across(jnp.sum(weights), axis)
 
     def attempt(i: Array) -> tuple[Array, Array, Array]:
         candidate = flat + config.backtrack_ratio**i * step
@@ -91,20 +118,19 @@ def improve(policy: Policy, batch: Batch, config: TRPOConfig) -> tuple[Policy, I
     )
 
 
-def fisher_product(policy: Policy, states: Array, mask: Array, damping: float) -> Callable[[Policy], Policy]:
-    """v -> (F + damping I) v, F the policy's Fisher matrix averaged over `states` [n, S] where `mask` [n] is 1.
+def fisher_product(
+    policy: Policy, at: Linearised, mask: Array, damping: float, axis: str | None = None
+) -> Callable[[Policy], Policy]:
+    """v -> (F + damping I) v, F the policy's Fisher matrix averaged over the steps where `mask` [C, 1, CHUNK] is 1.
 
     The Gaussian's Fisher matrix is J' diag(1 / std^2) J for the mean network and 2 I for log_std (Gauss-Newton), which
-    is the Hessian of KL(old || new) at new = old. The network is linearised once for all products.
+    is the Hessian of KL(old || new) at new = old.
     """
-    count = jnp.maximum(jnp.sum(mask), 1.0)
-    weights = mask[:, None] * jnp.exp(-2 * policy.log_std) / count
-    _, forward = jax.linearize(lambda layers: gaussian.mean(policy._replace(layers=layers), states), policy.layers)
-    backward = jax.linear_transpose(forward, policy.layers)
+    count = jnp.maximum(across(jnp.sum(mask), axis), 1.0)
+    weights = mask * jnp.exp(-2 * policy.log_std)[:, None] / count
 
     def product(v: Policy) -> Policy:
-        (layers,) = backward(weights * forward(v.layers))
-        curvature = Policy(layers, 2.0 * v.log_std)
+        curvature = Policy(across(gauss_newton(at, weights, v.layers), axis), 2.0 * v.log_std)
         return jax.tree.map(lambda c, x: c + damping * x, curvature, v)
 
     return product

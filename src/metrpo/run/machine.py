@@ -10,13 +10,17 @@ from typing import Literal
 
 from metrpo.errors import MetrpoError
 
+MAX_CPU_DEVICES = 8
+"""More would have few rollouts each."""
+
 INSTALL_GPU = "pip install 'metrpo[gpu]' (NVIDIA, CUDA 12)"
 
 
 def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
     """Sets JAX's environment variables; those already set by the user stay, but for what the arguments demand.
 
-    Must run before JAX and NumPy are imported. `deterministic` takes XLA down to one thread. Compiled code
+    Must run before JAX and NumPy are imported. A CPU becomes one JAX device per core, up to 8, which share the
+    imagined rollouts (see `metrpo.devices`); `deterministic` takes XLA down to one device and one thread. Compiled code
     is kept between processes in $JAX_COMPILATION_CACHE_DIR (default: metrpo/jax in the user's cache directory).
 
     Raises `MetrpoError` when `device` is "gpu" and JAX finds none.
@@ -26,15 +30,26 @@ def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
     elif not _may_have_gpu():
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
     if deterministic:
-        os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_multi_thread_eigen=false".strip()
+        _add_flags("--xla_force_host_platform_device_count=1", "--xla_cpu_multi_thread_eigen=false")
         os.environ["NPROC"] = "1"  # the size of XLA's thread pool; no XLA flag sets it
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
+    elif "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
+        _add_flags(f"--xla_force_host_platform_device_count={min(_cores(), MAX_CPU_DEVICES)}")
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(caches / "metrpo" / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     if device == "gpu":
         _require_gpu()
+
+
+def _add_flags(*flags: str) -> None:
+    os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
+
+
+def _cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _require_gpu() -> None:

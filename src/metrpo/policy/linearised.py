@@ -1,0 +1,95 @@
+"""The mean network linearised at a batch: its Jacobian J and transpose J', for gradients and Gauss-Newton products.
+
+Automatic differentiation gives the same products (the tests compare them) in almost twice the time, for it goes through
+memory at every operation. Here the batch lies features first, in chunks whose activations stay in the cache, and J and
+J' of a chunk follow each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from metrpo.types import Array
+
+CHUNK = 1000
+"""Steps per chunk: 64 activations of 1,000 steps are 256 kB."""
+
+Layers = tuple[tuple[Array, Array], ...]
+"""One (weights [in, out], biases [out]) a layer."""
+
+
+class Linearised(NamedTuple):
+    """The network at C chunks of states."""
+
+    layers: Layers
+    inputs: tuple[Array, ...]
+    """Of every layer: [C, in, CHUNK]."""
+    means: Array
+    """[C, A, CHUNK]"""
+
+
+def chunked(x: Array) -> Array:
+    """[n, F] or [n] -> [C, F or 1, CHUNK], features first, padded with zeros; a short batch is one chunk of its own."""
+    x = x.reshape(x.shape[0], -1)
+    size = min(CHUNK, x.shape[0])
+    x = jnp.pad(x, ((0, -x.shape[0] % size), (0, 0)))
+    return jnp.swapaxes(x.reshape(-1, size, x.shape[1]), 1, 2)
+
+
+def forward(layers: Layers, states: Array) -> tuple[Array, ...]:
+    """Inputs of every layer and the means, of one chunk of states [S, n]."""
+    values = [states]
+    for i, (weights, biases) in enumerate(layers):
+        output = weights.T @ values[-1] + biases[:, None]
+        values.append(jnp.tanh(output) if i < len(layers) - 1 else output)
+    return tuple(values)
+
+
+def linearise(layers: Layers, states: Array) -> Linearised:
+    """The network at chunked states [C, S, CHUNK]."""
+    *inputs, means = jax.lax.map(lambda chunk: forward(layers, chunk), states)
+    return Linearised(layers, tuple(inputs), means)
+
+
+def pull_back(at: Linearised, outputs: Array) -> Layers:
+    """J' outputs: [C, A, CHUNK] -> parameters, summed over the steps."""
+    return _sum_over_chunks(at, lambda inputs, given: _backward(at.layers, inputs, given), outputs)
+
+
+def gauss_newton(at: Linearised, weights: Array, tangent: Layers) -> Layers:
+    """J' diag(weights) J tangent, weights [C, A, CHUNK], summed over the steps."""
+
+    def product(inputs: tuple[Array, ...], given: Array) -> Layers:
+        return _backward(at.layers, inputs, given * _tangent(at.layers, inputs, tangent))
+
+    return _sum_over_chunks(at, product, weights)
+
+
+def _tangent(layers: Layers, inputs: tuple[Array, ...], tangent: Layers) -> Array:
+    """J tangent of one chunk: [A, n]."""
+    change = jnp.float32(0)
+    for i, ((weights, _), (dweights, dbiases)) in enumerate(zip(layers, tangent, strict=True)):
+        through = weights.T @ (change * (1 - jnp.square(inputs[i]))) if i else 0.0
+        change = dweights.T @ inputs[i] + through + dbiases[:, None]
+    return change
+
+
+def _backward(layers: Layers, inputs: tuple[Array, ...], outputs: Array) -> Layers:
+    """J' outputs of one chunk [A, n]."""
+    gradients = []
+    for i in reversed(range(len(layers))):
+        gradients.append((inputs[i] @ outputs.T, jnp.sum(outputs, axis=1)))
+        if i:
+            outputs = (layers[i][0] @ outputs) * (1 - jnp.square(inputs[i]))
+    return tuple(reversed(gradients))
+
+
+def _sum_over_chunks(at: Linearised, term: Callable[[tuple[Array, ...], Array], Layers], given: Array) -> Layers:
+    def add(total: Layers, chunk: tuple[tuple[Array, ...], Array]) -> tuple[Layers, None]:
+        return jax.tree.map(jnp.add, total, term(*chunk)), None
+
+    return jax.lax.scan(add, jax.tree.map(jnp.zeros_like, at.layers), (at.inputs, given))[0]

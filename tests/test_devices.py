@@ -1,0 +1,118 @@
+"""Work shared by several devices is the work of one: run in processes whose CPU is several JAX devices."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from metrpo import devices
+
+PREAMBLE = """
+import jax, numpy as np
+import jax.numpy as jnp
+from functools import partial
+from jax.sharding import PartitionSpec as P
+from helpers import random_ensemble, random_policy
+from metrpo import devices
+"""
+
+FIT = """
+from metrpo.config import FitConfig
+from metrpo.model import ensemble as ensembles
+from metrpo.model.fit import fit
+from metrpo.types import Transitions
+rng = np.random.default_rng(0)
+states, actions = (rng.normal(size=(300, n)).astype(np.float32) for n in (3, 2))
+data = Transitions(states, actions, np.tanh(states) * actions[:, :1], 300)
+networks = ensembles.init(jax.random.key(0), 6, 3, 2, (16,))
+normaliser = ensembles.normaliser_of(data, 0.1, 0.1)
+fitted, info = fit(networks, normaliser, data, data, FitConfig(batch_size=32, max_passes=5), jax.random.key(1))
+assert len(fitted.networks[0][0].sharding.device_set) == len(jax.devices())
+np.savez(OUT, *jax.tree.leaves(fitted), *jax.tree.leaves(info))
+"""
+
+IMPROVE = """
+from metrpo.config import TRPOConfig
+from metrpo.policy import advantage, trpo
+from metrpo.types import Trajectories
+rng = np.random.default_rng(0)
+policy = random_policy(0, 4, 2, hidden=(8,))
+states, actions = (rng.normal(size=(7, 6, n)).astype(np.float32) for n in (4, 2))
+rewards, mask = rng.normal(size=(7, 6)).astype(np.float32), (rng.uniform(size=(7, 6)) < 0.8).astype(np.float32)
+mesh = devices.mesh(6, "rollouts")
+assert mesh.size == len(jax.devices())
+
+def work(policy, baseline, *given):
+    t = Trajectories(*given)
+    advantages, baseline = advantage.advantages_and_baseline(t, baseline, 0.9, 0.9, 0.1, "rollouts")
+    flat = [jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]) for x in (t.states, t.actions, advantages, t.mask)]
+    return advantages, baseline, trpo.improve(policy, trpo.Batch(*flat), TRPOConfig(damping=0.1), "rollouts")
+
+share = P(None, "rollouts")
+specs = {"in_specs": (P(), P(), share, share, share, share), "out_specs": (share, P(), P())}
+shared = jax.jit(jax.shard_map(work, mesh=mesh, check_vma=False, **specs))
+out = shared(policy, advantage.init_baseline(4), states, actions, rewards, mask)
+assert out[2][1].accepted
+np.savez(OUT, *jax.tree.leaves(out))
+"""
+
+IMAGINE = """
+from metrpo.model.imagine import imagine
+ensemble = random_ensemble(members=3, scale=0.3)
+starts = np.random.default_rng(1).normal(size=(6, 4)).astype(np.float32)
+mesh = devices.mesh(6, "rollouts")
+
+def work(starts):
+    act = lambda states, key: jnp.zeros((len(states), 2)) + jax.random.normal(key, (len(states), 2))
+    return imagine(ensemble, act, lambda s, a, n: n[:, 0], None, starts, 5, jax.random.key(0), axis="rollouts")
+
+share = P(None, "rollouts")
+t, info = jax.jit(
+    jax.shard_map(work, mesh=mesh, in_specs=P("rollouts"), out_specs=(share, P()), check_vma=False)
+)(starts)
+np.testing.assert_array_equal(t.states[0], starts)
+np.testing.assert_allclose(info.mean_return, np.sum(t.rewards) / 6, rtol=1e-5)
+assert (float(info.diverged), float(info.steps)) == (0, 30)
+noise = np.asarray(t.actions).reshape(-1)
+assert len(set(noise.tolist())) == noise.size, "two devices drew the same noise"
+np.savez(OUT, np.zeros(1))
+"""
+
+
+def results(code: str, count: int, out: Path) -> list:
+    """What `code` saves to OUT in a process with `count` CPU devices."""
+    flags = f"--xla_force_host_platform_device_count={count}"
+    tests = str(Path(__file__).parent)
+    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": tests}
+    program = PREAMBLE + f"assert len(jax.devices()) == {count}\nOUT = {str(out)!r}\n" + code
+    ran = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    with np.load(out) as file:
+        return [file[name] for name in file.files]
+
+
+@pytest.mark.parametrize(("code", "atol"), [(FIT, 1e-5), (IMPROVE, 1e-4)], ids=["fit", "improve"])
+def test_several_devices_find_what_one_finds(code, atol, tmp_path):
+    one, several = (results(code, n, tmp_path / f"{n}.npz") for n in (1, 3))
+    assert len(one) == len(several)
+    for ours, theirs in zip(several, one, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=atol, rtol=1e-4)
+
+
+def test_each_device_imagines_rollouts_of_its_own(tmp_path):
+    results(IMAGINE, 3, tmp_path / "out.npz")
+
+
+@pytest.mark.parametrize(("count", "available", "size"), [(500, 2, 2), (50, 4, 2), (7, 4, 1), (5, 8, 5), (1, 3, 1)])
+def test_as_many_devices_as_divide_the_work(count, available, size, monkeypatch):
+    monkeypatch.setattr(jax, "devices", lambda: [f"device {i}" for i in range(available)])
+    monkeypatch.setattr(devices, "Mesh", lambda chosen, axes: (list(chosen), axes))
+    chosen, axes = devices.mesh(count, "members")
+    assert chosen == [f"device {i}" for i in range(size)]
+    assert axes == ("members",)
