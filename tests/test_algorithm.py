@@ -331,7 +331,7 @@ class Script:
     def __init__(self, monkeypatch, tiny, values, **settings):
         self.values, self.blocks, self.fixed_starts, self.starts = values, [], [], []
         monkeypatch.setattr(phase, "_updates", self._updates)
-        monkeypatch.setattr(phase, "_validate", self._validate)
+        monkeypatch.setattr(phase, "values_of", self._validate)
         self.state = tiny.states[2]._replace(baseline=np.zeros(8, np.float32))
         layers = ((np.zeros((2, 2), np.float32), np.zeros(2, np.float32)),)
         self.state = self.state._replace(policy=gaussian.Policy(layers, np.full(2, -3.0, np.float32)))

@@ -132,7 +132,7 @@ IMPOSSIBLE = {
     "validate.starts": [0],
 }
 FREE = {"preset", "improver", "deterministic", "collect.std_per", "fit.loss_units", "imagine.sampling", "imagine.start"}
-FREE |= {"validate.rule"}
+FREE |= {"validate.rule", "fit.products", "imagine.products"}
 
 
 def test_every_number_has_its_impossible_values_listed_here():

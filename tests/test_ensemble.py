@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -113,3 +114,35 @@ def test_unseen_dimensions_have_no_influence_and_are_predicted_all_the_same():
     assert not np.allclose(predict_delta(ensemble, seen, actions), deltas)
     # What normalises the prediction of an unseen dimension is its own spread.
     np.testing.assert_allclose(normaliser.delta_std, train.deltas.std(0), rtol=1e-4)
+
+
+def test_bfloat16_products_are_the_float32_ones_of_rounded_operands():
+    """The products of bfloat16 numbers are exact in float32, so only the operands' rounding may show."""
+    rng = np.random.default_rng(0)
+    x, weights = rng.normal(size=(3, 7, 5)).astype(np.float32), rng.normal(size=(3, 5, 4)).astype(np.float32)
+    rounded = [np.asarray(jnp.asarray(a, jnp.bfloat16), np.float64) for a in (x, weights)]
+    given = (jnp.asarray(x), jnp.asarray(weights, jnp.bfloat16))
+    got, pull_back = jax.vjp(ensembles._product, *given)
+    assert got.dtype == jnp.float32
+    np.testing.assert_allclose(got, np.einsum("kbi,kio->kbo", *rounded), rtol=1e-5, atol=1e-5)
+    slope = jnp.asarray(rng.normal(size=got.shape), jnp.bfloat16).astype(jnp.float32)
+    to_x, to_weights = pull_back(slope)
+    np.testing.assert_allclose(to_x, np.einsum("kbo,kio->kbi", slope, rounded[1]), rtol=1e-5, atol=1e-5)
+    expected = np.einsum("kbi,kbo->kio", rounded[0], slope)
+    np.testing.assert_allclose(np.asarray(to_weights, np.float32), expected, rtol=1e-2, atol=1e-2)
+
+
+def test_products_in_bfloat16_change_predictions_little_and_float32_ones_not_at_all():
+    ensemble = jax.tree.map(jnp.asarray, random_ensemble(hidden=(16, 16)))
+    rng = np.random.default_rng(1)
+    states, actions = (rng.normal(size=(3, 50, n)).astype(np.float32) for n in (4, 2))
+    exact = np.asarray(predict_delta(ensemble, states, actions))
+    same, coarse = (
+        np.asarray(
+            predict_delta(ensemble._replace(networks=ensembles.with_products(ensemble.networks, t)), states, actions)
+        )
+        for t in ("float32", "bfloat16")
+    )
+    np.testing.assert_array_equal(same, exact)
+    difference = np.sqrt(np.mean((coarse - exact) ** 2) / np.mean(exact**2))
+    assert 1e-4 < difference < 0.02

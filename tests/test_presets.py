@@ -43,6 +43,8 @@ CITED = {
     "advantage.ridge": (1e-5, "code: linear feature baseline"),
     "trpo.max_kl": (0.01, "A.1.3: step size delta_KL 0.01"),
     "trpo.cg_iterations": (10, "code"),
+    "fit.products": ("float32", "code"),
+    "imagine.products": ("float32", "code"),
     "trpo.fisher_every": (1, "every step, as nothing else is said"),
     "trpo.damping": (1e-5, "code"),
     "trpo.backtrack_ratio": (0.8, "code"),

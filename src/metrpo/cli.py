@@ -1,4 +1,4 @@
-"""The command line: `metrpo train | evaluate | render | tasks | doctor`.
+"""The command line: `metrpo train | evaluate | render | tasks | doctor | bench`.
 
 Whatever imports JAX or MuJoCo is imported where it is used: help must come at once, and JAX reads its environment
 variables when imported.
@@ -18,7 +18,7 @@ from typing import Any
 
 from metrpo.config import Config
 from metrpo.errors import MetrpoError
-from metrpo.options import Doctor, Evaluate, Render, Tasks, Train, parse
+from metrpo.options import Bench, Doctor, Evaluate, Render, Tasks, Train, parse
 
 
 class _Terminated(BaseException):
@@ -128,6 +128,20 @@ def _doctor(command: Doctor) -> int:
     return 1 if found.problems else 0
 
 
+def _bench(command: Bench) -> int:
+    from metrpo.run import machine
+
+    machine.prepare(None, deterministic=False)
+    from metrpo.bench.report import bench
+
+    def tell(text: str) -> None:
+        print(f"metrpo bench: {text}", file=sys.stderr, flush=True)
+
+    report = bench(command.peers, command.rounds, command.iterations, tell)
+    print(json.dumps(report.record(), indent=2) if command.json else report.text())
+    return 0
+
+
 def _version() -> int:
     from metrpo.run.files import metrpo_version
 
@@ -145,4 +159,5 @@ _COMMANDS: dict[type, Callable[[Any], int]] = {
     Render: _render,
     Tasks: _tasks,
     Doctor: _doctor,
+    Bench: _bench,
 }

@@ -90,6 +90,8 @@ class FitConfig:
     """Transitions per minibatch, drawn with replacement and for each model independently."""
     loss_units: Literal["raw", "std"] = "raw"
     """Units of the squared error, summed over state dimensions: raw state units (the paper), or each one's std."""
+    products: Literal["float32", "bfloat16"] = "float32"
+    """Type of the matrix products' operands, and so of the weights' gradients; sums and Adam stay float32."""
     validate_every: int = 5
     """Passes over the training set between two validations."""
     patience: int = 25
@@ -120,6 +122,9 @@ class ImagineConfig:
     """How the next state comes out of the ensemble; step_rand: one model drawn per state and step."""
     start: Literal["dataset", "reset"] = "dataset"
     """Start states of imagined episodes: those of real episodes in the dataset, or fresh real resets (uncounted)."""
+
+    products: Literal["float32", "bfloat16"] = "float32"
+    """Type of the operands of the ensemble's matrix products, in imagination and in validation."""
 
     def __post_init__(self) -> None:
         _require(self.steps >= 1, "imagine.steps", self.steps, "at least 1")
@@ -247,7 +252,7 @@ class Config:
 BUDGET_FIELDS = ("iterations", "real_steps")
 """Fields that say how long to run, not what is run: they may change when a run is resumed."""
 
-ADDED = ("config.trpo.fisher_every",)
+ADDED = ("config.fit.products", "config.imagine.products", "config.trpo.fisher_every")
 """Settings newer than the first config.json files: where one is missing, its default is what was done then."""
 
 

@@ -12,6 +12,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from metrpo.config import Config
+from metrpo.errors import ConfigError
 
 _BUDGET = tyro.conf.create_mutex_group(required=False)
 
@@ -102,7 +103,31 @@ class Doctor:
     """Print JSON."""
 
 
-Command = Train | Evaluate | Render | Tasks | Doctor
+@dataclass(frozen=True)
+class Bench:
+    """Measure this machine and our work on it: fitting, imagination, policy updates, whole iterations.
+
+    Run nothing else meanwhile. Every piece is timed once a round, so that all see the same machine; medians count.
+    For example:
+        metrpo bench
+        metrpo bench --peers --rounds 9 --json > bench.json
+    """
+
+    peers: bool = False
+    """Measure mbrl-lib, sb3-contrib and PyTorch too; the first time installs them (gigabytes), apart from ours."""
+    rounds: int = 7
+    """How often each piece is timed."""
+    iterations: bool = True
+    """Time whole outer iterations and the start of a process too (minutes)."""
+    json: bool = False
+    """Print JSON."""
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1:
+            raise ConfigError(f"rounds: expected at least 1, got {self.rounds}")
+
+
+Command = Train | Evaluate | Render | Tasks | Doctor | Bench
 
 _DESCRIPTION = """Model-Ensemble Trust-Region Policy Optimization: control learnt from few real steps.
 
@@ -146,6 +171,7 @@ def _with_defaults(train: Train, arguments: list[str], quiet: bool = False) -> C
         | Annotated[Render, subcommand("render")]
         | Annotated[Tasks, subcommand("tasks")]
         | Annotated[Doctor, subcommand("doctor")]
+        | Annotated[Bench, subcommand("bench")]
     )
     return tyro.cli(
         commands,

@@ -17,7 +17,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from metrpo import devices
 from metrpo.config import Config
-from metrpo.model.ensemble import Ensemble
+from metrpo.model.ensemble import Ensemble, with_products
 from metrpo.model.imagine import ImagineInfo, imagine, returns_per_model
 from metrpo.policy import advantage, gaussian, trpo
 from metrpo.policy.gaussian import Policy
@@ -66,8 +66,9 @@ def improve(
     in states drawn from `pool` [E, S] by `rng`; `on_validation(updates, updates accepted, value)` follows every one.
     """
     rule = RULES[config.validate.rule]
+    ensemble = ensemble._replace(networks=with_products(ensemble.networks, config.imagine.products))
     fixed_starts = pool[rng.integers(len(pool), size=config.validate.starts)]
-    accepted, reference = policy, _validate(task, ensemble, policy, fixed_starts)
+    accepted, reference = policy, values_of(task, ensemble, policy, fixed_starts)
     updates = accepted_at = 0
     infos: list[tuple[trpo.ImproveInfo, ImagineInfo]] = []
     fractions: list[float] = []
@@ -80,7 +81,7 @@ def improve(
         infos.append(jax.device_get(info))
         updates += block
         with clock("validate"):
-            values = _validate(task, ensemble, policy, fixed_starts)
+            values = values_of(task, ensemble, policy, fixed_starts)
         verdict = rule(values, reference, config.validate)
         fractions.append(verdict.fraction_improved)
         if verdict.accepted:
@@ -186,7 +187,8 @@ def _compiled_validate(task: Task, mesh: Mesh, ensemble: Ensemble, policy: Polic
     )(ensemble, policy, starts)
 
 
-def _validate(task: Task, ensemble: Ensemble, policy: Policy, starts: np.ndarray) -> np.ndarray:
+def values_of(task: Task, ensemble: Ensemble, policy: Policy, starts: np.ndarray) -> np.ndarray:
+    """[K]: mean return of the deterministic policy from `starts` [N, S] in each model alone."""
     mesh = devices.mesh(len(starts), AXIS)
     ensemble, policy = devices.copied((ensemble, policy), mesh)
     return np.asarray(_compiled_validate(task, mesh, ensemble, policy, starts))

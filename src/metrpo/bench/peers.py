@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import IO
 
 from metrpo.errors import MetrpoError
+from metrpo.run.machine import cores
 
 REQUIREMENTS = (
     "torch==2.13.0",
@@ -199,11 +200,10 @@ class Worker:
 
 
 def _threads() -> dict[str, str]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     # OpenMP's threads would otherwise spin after their work, on the cores that the next one to be measured needs.
     return {
-        "OMP_NUM_THREADS": str(cores),
-        "MKL_NUM_THREADS": str(cores),
+        "OMP_NUM_THREADS": str(cores()),
+        "MKL_NUM_THREADS": str(cores()),
         "OMP_WAIT_POLICY": "PASSIVE",
         "KMP_BLOCKTIME": "0",
     }

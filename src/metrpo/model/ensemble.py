@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental.layout import Layout, with_layout_constraint
 
 from metrpo.types import Array, Normaliser, Transitions
 
@@ -85,6 +86,47 @@ def predict_delta(ensemble: Ensemble, states: Array, actions: Array) -> Array:
     )
     *inner, (last_weights, last_biases) = ensemble.networks
     for weights, biases in inner:
-        hidden = jax.nn.relu(jnp.einsum("kbi,kio->kbo", hidden, weights) + biases)
-    output = jnp.einsum("kbi,kio->kbo", hidden, last_weights) + last_biases
+        hidden = jax.nn.relu(_product(hidden, weights) + biases)
+    output = _product(hidden, last_weights) + last_biases
     return n.delta_mean + n.delta_std * output
+
+
+def with_products(networks: Networks, dtype: str) -> Networks:
+    """The networks with weights of `dtype`, in which their matrix products are then taken; sums stay float32."""
+    return tuple((weights.astype(dtype), biases) for weights, biases in networks)
+
+
+def _product(x: Array, weights: Array) -> Array:
+    """[K, B, I], [K, I, O] -> [K, B, O], float32."""
+    if weights.dtype == jnp.bfloat16:
+        return _bfloat16_product(x, weights)
+    return jnp.einsum("kbi,kio->kbo", x, weights)
+
+
+@jax.custom_vjp
+def _bfloat16_product(x: Array, weights: Array) -> Array:
+    return _member_by_member(x.astype(jnp.bfloat16), weights)
+
+
+def _forward(x: Array, weights: Array) -> tuple[Array, tuple[Array, Array]]:
+    x = x.astype(jnp.bfloat16)
+    return _member_by_member(x, weights), (x, weights)
+
+
+def _backward(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
+    x, weights = saved
+    gradient = gradient.astype(jnp.bfloat16)
+    # On CPUs x' g takes twice as long unless x' lies in memory as its shape says.
+    transposed = jnp.swapaxes(x, 1, 2)
+    transposed = with_layout_constraint(transposed, Layout(major_to_minor=(0, 1, 2)))
+    to_x = _member_by_member(gradient, jnp.swapaxes(weights, 1, 2))
+    return to_x, _member_by_member(transposed, gradient).astype(weights.dtype)
+
+
+_bfloat16_product.defvjp(_forward, _backward)
+
+
+def _member_by_member(a: Array, b: Array) -> Array:
+    """[K, M, N], [K, N, P] -> [K, M, P] in float32; faster than one batched product in bfloat16."""
+    pairs = zip(a, b, strict=True)
+    return jnp.stack([jnp.matmul(x, y, preferred_element_type=jnp.float32) for x, y in pairs])

@@ -16,7 +16,7 @@ import optax
 
 from metrpo import devices
 from metrpo.config import FitConfig
-from metrpo.model.ensemble import Ensemble, Networks, predict_delta
+from metrpo.model.ensemble import Ensemble, Networks, predict_delta, with_products
 from metrpo.types import Array, Normaliser, Transitions
 
 VALIDATION_CHUNK = 1000
@@ -124,7 +124,8 @@ def _train_and_validate(
     block_key = jax.random.fold_in(key, passes)
 
     def total_loss(networks: Networks, *batch: Array) -> tuple[Array, Array]:
-        losses = jnp.mean(loss_of(Ensemble(networks, normaliser), config.loss_units, *batch), axis=-1)
+        ensemble = Ensemble(with_products(networks, config.products), normaliser)
+        losses = jnp.mean(loss_of(ensemble, config.loss_units, *batch), axis=-1)
         return jnp.sum(losses), losses
 
     def step(i: Array, carry: tuple[Networks, optax.OptState, Array]) -> tuple[Networks, optax.OptState, Array]:

@@ -62,20 +62,26 @@ def pull_back(at: Linearised, outputs: Array) -> Layers:
 
 def gauss_newton(at: Linearised, weights: Array, tangent: Layers) -> Layers:
     """J' diag(weights) J tangent, weights [C, A, CHUNK], summed over the steps."""
+    transposed, tangent_transposed = _transposed(at.layers), _transposed(tangent)
 
     def product(inputs: tuple[Array, ...], given: Array) -> Layers:
-        return _backward(at.layers, inputs, given * _tangent(at.layers, inputs, tangent))
+        return _backward(at.layers, inputs, given * _tangent(transposed, inputs, tangent_transposed))
 
     return _sum_over_chunks(at, product, weights)
 
 
 def _tangent(layers: Layers, inputs: tuple[Array, ...], tangent: Layers) -> Array:
-    """J tangent of one chunk: [A, n]."""
+    """J tangent of one chunk, [A, n]; the weights of both come transposed, [out, in]."""
     change = jnp.float32(0)
     for i, ((weights, _), (dweights, dbiases)) in enumerate(zip(layers, tangent, strict=True)):
-        through = weights.T @ (change * (1 - jnp.square(inputs[i]))) if i else 0.0
-        change = dweights.T @ inputs[i] + through + dbiases[:, None]
+        through = weights @ (change * (1 - jnp.square(inputs[i]))) if i else 0.0
+        change = dweights @ inputs[i] + through + dbiases[:, None]
     return change
+
+
+def _transposed(layers: Layers) -> Layers:
+    """Weights [out, in], written out once (the barrier), for a product that transposes as it goes is 8 % slower."""
+    return jax.lax.optimization_barrier(tuple((weights.T, biases) for weights, biases in layers))
 
 
 def _backward(layers: Layers, inputs: tuple[Array, ...], outputs: Array) -> Layers:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import importlib
-import os
 import platform
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 
 from metrpo.run import video
 from metrpo.run.files import metrpo_version
-from metrpo.run.machine import INSTALL_GPU, has_nvidia
+from metrpo.run.machine import INSTALL_GPU, cores, has_nvidia
 
 NEEDED = ("jax", "jaxlib", "mujoco", "gymnasium", "numpy", "optax")
 
@@ -44,9 +43,7 @@ class Diagnosis:
 def diagnose() -> Diagnosis:
     """Looks at versions, devices, OpenGL and the encoder of this machine."""
     versions: dict[str, str | None] = {"python": platform.python_version(), "metrpo": metrpo_version()}
-    found = Diagnosis(
-        versions | {n: _version(n) for n in NEEDED}, _cores(), [], video.gl_backend(), video.has_encoder()
-    )
+    found = Diagnosis(versions | {n: _version(n) for n in NEEDED}, cores(), [], video.gl_backend(), video.has_encoder())
     for name in NEEDED:
         try:
             importlib.import_module(name)
@@ -70,10 +67,6 @@ def _look_for_devices(found: Diagnosis) -> None:
         found.problems.append(f"JAX finds no device ({error}): unset JAX_PLATFORMS or use --device cpu")
     if has_nvidia() and not any(device.startswith("gpu") for device in found.devices):
         found.hints.append(f"there is an NVIDIA GPU, but JAX does not use it: {INSTALL_GPU}")
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _version(name: str) -> str | None:

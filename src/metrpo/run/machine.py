@@ -34,7 +34,7 @@ def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
         os.environ["NPROC"] = "1"  # the size of XLA's thread pool; no XLA flag sets it
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
     elif "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
-        _add_flags(f"--xla_force_host_platform_device_count={min(_cores(), MAX_CPU_DEVICES)}")
+        _add_flags(f"--xla_force_host_platform_device_count={min(cores(), MAX_CPU_DEVICES)}")
     caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(caches / "metrpo" / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
@@ -47,7 +47,7 @@ def _add_flags(*flags: str) -> None:
     os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
 
 
-def _cores() -> int:
+def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
