@@ -252,3 +252,28 @@ def test_masked_steps_have_no_influence():
     clean, _ = improve(policy, batch, damped)
     for ours, theirs in zip(jax.tree.leaves(improve(policy, kept, damped)[0]), jax.tree.leaves(clean), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-4)
+
+
+def test_every_nth_step_makes_the_fisher_matrix_and_all_steps_the_rest():
+    """Against a dense solve with the Fisher matrix of every third step and the gradient of all of them."""
+    policy = random_policy(5, hidden=(3,))
+    batch = a_batch(6, policy)
+    config = TRPOConfig(max_kl=1e-3, cg_iterations=60, damping=0.05, fisher_every=3)
+    new, info = improve(policy, batch, config)
+    flat, unravel = ravel_pytree(policy)
+
+    def surrogate(parameters):
+        p = unravel(parameters)
+        means = gaussian.mean(p, jnp.asarray(batch.states))
+        log_probability = gaussian.log_probability(means, p.log_std, batch.actions)
+        return jnp.sum(batch.mask * batch.advantages / batch.mask.sum() * log_probability)
+
+    gradient = np.asarray(jax.jit(jax.grad(surrogate))(flat), np.float64)
+    fisher = dense_fisher(policy, batch.states[::3], batch.mask[::3]) + 0.05 * np.eye(flat.size)
+    x = np.linalg.solve(fisher, gradient)
+    full = x * np.sqrt(2 * config.max_kl / (x @ fisher @ x))
+    step = np.asarray(ravel_pytree(new)[0], np.float64) - np.asarray(flat, np.float64)
+    assert info.accepted
+    np.testing.assert_allclose(step, full * 0.8 ** int(info.backtracks), atol=2e-3 * np.abs(full).max())
+    every, _ = improve(policy, batch, TRPOConfig(max_kl=1e-3, cg_iterations=60, damping=0.05))
+    assert not np.allclose(ravel_pytree(every)[0] - flat, step, atol=1e-2 * np.abs(full).max())
