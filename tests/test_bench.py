@@ -8,6 +8,7 @@ import pytest
 
 from metrpo.bench import ours, peers, report
 from metrpo.cli import main
+from metrpo.presets import override, preset
 
 
 def test_operations_are_those_of_the_layers():
@@ -102,3 +103,27 @@ def test_a_wrong_number_of_rounds_is_named(capsys):
 @pytest.mark.parametrize("name", ["trpo-1-cg", "baseline", "collect", "imagine-200x4", "validate-200x2"])
 def test_real_work_runs_and_takes_time(name):
     assert 0 < ours.works()[name]().run() < 60
+
+
+def test_whole_iterations_are_timed_and_their_compilations_counted(monkeypatch):
+    small = {
+        "iterations": 3,
+        "collect.steps": 200,
+        "ensemble.hidden": (4,),
+        "ensemble.members": 2,
+        "fit.max_steps": 5,
+        "imagine.steps": 400,
+        "validate.starts": 2,
+        "validate.max_updates": 5,
+        "evaluation_episodes": 1,
+    }
+    monkeypatch.setattr(ours, "small_iteration", lambda: override(preset("Swimmer"), small))
+    monkeypatch.setattr(report, "_start_to_imagined", lambda: 1.5)
+    measured = report._iterations(lambda text: None)
+    assert len(measured.seconds) == 3
+    assert measured.compilations[0] > 5
+    assert measured.compilations[2] == 0
+    assert all(0 < share < 1 for share in measured.outside)
+    text = report.Report({}, [], measured).text()
+    assert "compilations: " in text
+    assert "compile cache warm: 1.5 s" in text

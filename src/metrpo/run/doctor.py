@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import platform
+from collections import Counter
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 
@@ -62,7 +63,8 @@ def _look_for_devices(found: Diagnosis) -> None:
     import jax
 
     try:
-        found.devices = [f"{device.platform}: {device.device_kind}" for device in jax.devices()]
+        names = Counter(f"{device.platform}: {device.device_kind}" for device in jax.devices())
+        found.devices = [name if count == 1 else f"{count} x {name}" for name, count in names.items()]
     except RuntimeError as error:
         found.problems.append(f"JAX finds no device ({error}): unset JAX_PLATFORMS or use --device cpu")
     if has_nvidia() and not any(device.startswith("gpu") for device in found.devices):
