@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from metrpo import read_metrics
+from metrpo.bench.report import Report
 
 ROOT = Path(__file__).resolve().parents[1]
 RUNS = sorted(path.parent for path in (ROOT / "results").glob("*/*/*/seed-*/metrics.csv"))
@@ -32,3 +33,9 @@ def test_the_readmes_table_is_the_one_that_the_metrics_give():
     summarise = runpy.run_path(str(ROOT / "benchmarks" / "summarise.py"))
     table = summarise["table"]([ROOT / "results"])
     assert table in (ROOT / "README.md").read_text(), "run: python benchmarks/summarise.py, and put the table in"
+
+
+def test_the_performance_table_is_the_recorded_one():
+    recorded = json.loads((ROOT / "results" / "performance" / "bench.json").read_text())
+    text = Report.of(recorded).text()
+    assert text in (ROOT / "docs" / "performance.md").read_text(), "paste what Report.of(bench.json).text() gives"

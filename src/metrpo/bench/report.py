@@ -68,6 +68,12 @@ class Report:
     timings: list[Timing]
     iterations: Iterations | None = None
 
+    @staticmethod
+    def of(record: dict[str, Any]) -> Report:
+        """The report that `record` was taken of."""
+        iterations = record["iterations"] and Iterations(**record["iterations"])
+        return Report(record["machine"], [Timing(**timing) for timing in record["timings"]], iterations)
+
     def record(self) -> dict[str, Any]:
         """For a script to read."""
         return asdict(self)
@@ -92,7 +98,7 @@ class Report:
             lines += ["  compilations: " + ", ".join(map(str, i.compilations))]
             if i.start_to_imagined is not None:
                 lines += [f"  from start to the first imagined steps, compile cache warm: {i.start_to_imagined:.1f} s"]
-        return "\n".join(lines)
+        return "\n".join(line.rstrip() for line in lines)
 
 
 def _row(t: Timing) -> tuple[str, ...]:
