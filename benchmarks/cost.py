@@ -80,20 +80,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("docs/cost.png"))
     parser.add_argument("--record", type=Path, default=Path("results/performance/cost.json"))
+    parser.add_argument("--redraw", action="store_true", help="only draw what is recorded")
     arguments = parser.parse_args()
-    record = {
-        name: [BASE | {name: value} | cost(**(BASE | {name: value})) for value in values]
-        for name, values in GRID.items()
-    }
-    arguments.record.parent.mkdir(parents=True, exist_ok=True)
-    arguments.record.write_text(json.dumps(record, indent=1) + "\n")
+    if not arguments.redraw:
+        measured = {
+            name: [BASE | {name: value} | cost(**(BASE | {name: value})) for value in values]
+            for name, values in GRID.items()
+        }
+        arguments.record.parent.mkdir(parents=True, exist_ok=True)
+        arguments.record.write_text(json.dumps(measured, indent=1) + "\n")
+    record = json.loads(arguments.record.read_text())
     figure = Figure(figsize=(13, 3.6), dpi=130, layout="constrained")
     for axes, (name, rows) in zip(figure.subplots(1, len(record), sharey=True), record.items(), strict=True):
         for what, label in (("fit", f"{STEPS} training steps"), ("improve", "5 policy updates, 1 validation")):
             axes.plot([row[name] for row in rows], [row[what] for row in rows], "o-", label=label)
         axes.set_xscale("log")
         axes.set_yscale("log")
-        axes.set_xticks(GRID[name], [f"{value:,}" for value in GRID[name]])
+        axes.set_xticks(GRID[name], [f"{value // 1000}k" if value > 9999 else str(value) for value in GRID[name]])
         axes.minorticks_off()
         axes.set_xlabel({"transitions": "training transitions", "width": "width of both layers"}.get(name, name))
         axes.grid(True, color="#dddddd", linewidth=0.7)
