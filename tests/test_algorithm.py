@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import math
 import types
@@ -16,6 +15,7 @@ import pytest
 import probe
 from helpers import linear_ensemble, random_ensemble, random_policy, slow_mean
 from metrpo import algorithm, phase
+from metrpo.bench.report import compilations
 from metrpo.config import Config
 from metrpo.model.imagine import ImagineInfo, imagine
 from metrpo.policy import advantage, gaussian, trpo
@@ -51,22 +51,6 @@ def _probe_is_a_task():
         for task in (probe.PROBE, probe.ENDING_PROBE):
             patch.setitem(task_module._TASKS, task.name, task)
         yield
-
-
-@contextlib.contextmanager
-def compilations():
-    """A list that grows by one with every compilation inside the block."""
-    seen = []
-
-    def listen(event, duration, **_):
-        if event == "/jax/core/compile/backend_compile_duration":
-            seen.append(duration)
-
-    jax.monitoring.register_event_duration_secs_listener(listen)
-    try:
-        yield seen
-    finally:
-        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def run(config, iterations=4):

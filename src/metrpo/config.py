@@ -122,7 +122,6 @@ class ImagineConfig:
     """How the next state comes out of the ensemble; step_rand: one model drawn per state and step."""
     start: Literal["dataset", "reset"] = "dataset"
     """Start states of imagined episodes: those of real episodes in the dataset, or fresh real resets (uncounted)."""
-
     products: Literal["float32", "bfloat16"] = "float32"
     """Type of the operands of the ensemble's matrix products, in imagination and in validation."""
 

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import IO
 
 from metrpo.errors import MetrpoError
-from metrpo.run.machine import cores
+from metrpo.run.machine import cache_folder, cores
 
 REQUIREMENTS = (
     "torch==2.13.0",
@@ -96,9 +96,8 @@ def environment() -> Path:
 
 
 def _folder() -> Path:
-    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     content = "\n".join([*REQUIREMENTS, *ALONE, f"{sys.version_info.major}.{sys.version_info.minor}"])
-    return caches / "metrpo" / f"peers-{hashlib.sha256(content.encode()).hexdigest()[:10]}"
+    return cache_folder() / f"peers-{hashlib.sha256(content.encode()).hexdigest()[:10]}"
 
 
 def _python() -> Path:

@@ -8,8 +8,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from importlib.metadata import version
@@ -21,7 +21,7 @@ import jax
 from metrpo import algorithm
 from metrpo.bench import ours, peers
 from metrpo.run.directory import RunDirectory
-from metrpo.run.machine import cores
+from metrpo.run.machine import cores, device_names
 
 Tell = Callable[[str], None]
 
@@ -130,13 +130,14 @@ def bench(with_peers: bool, rounds: int, whole_iterations: bool, tell: Tell = la
             if not peers.is_installed():
                 tell("installing the peers, once")
             workers = {name: stack.enter_context(peers.Worker(name)) for name in peers.PEERS}
-        for name, make in ours.works().items():
+        available = ours.works()
+        for name, make in available.items():
             tell(f"preparing {name}")
             works[name] = make()
             runs[name, "metrpo"] = works[name].run
             for peer, worker in workers.items():
                 for theirs in peers.WORK[peer]:
-                    if _counterpart(theirs, ours.works()) == name:
+                    if _counterpart(theirs, available) == name:
                         runs[theirs, peer] = partial(_measure, worker, theirs)
         seconds: dict[tuple[str, str], list[float]] = {key: [] for key in runs}
         for number in range(rounds):
@@ -183,8 +184,7 @@ def _machine() -> dict[str, Any]:
     return {
         "processor": _processor(),
         "cores": cores(),
-        "devices": ", ".join(sorted({f"{d.platform} {d.device_kind}" for d in jax.devices()}))
-        + f" x {len(jax.devices())}",
+        "devices": ", ".join(device_names()),
         "python": platform.python_version(),
         "jax": version("jax"),
     }
@@ -202,31 +202,38 @@ def _processor() -> str:
 def _iterations(tell: Tell) -> Iterations:
     """A run of three iterations, with everything that `metrpo train` writes but the video."""
     config = ours.small_iteration()
+    jax.clear_caches()
+    seconds, outside, counts = [], [], []
+    with tempfile.TemporaryDirectory() as scratch, RunDirectory(Path(scratch) / "run", config) as run:
+        state = algorithm.init(config)
+        while not algorithm.finished(config, state):
+            tell(f"outer iteration {state.iteration + 1} of {config.iterations}")
+            start = time.perf_counter()
+            with compilations() as seen:
+                state, row = algorithm.step(config, state)
+                run.save(state, row)
+            seconds.append(time.perf_counter() - start)
+            stages = sum(value for name, value in row.items() if name.startswith("seconds_"))
+            outside.append(1 - stages / seconds[-1])
+            counts.append(len(seen))
+    tell("starting a process")
+    return Iterations(seconds, outside, counts, _start_to_imagined())
+
+
+@contextmanager
+def compilations() -> Iterator[list[float]]:
+    """A list that grows by the seconds of every compilation inside the block."""
     seen: list[float] = []
 
-    def count(event: str, duration_secs: float, **_: str | int) -> None:
+    def listen(event: str, duration_secs: float, **_: str | int) -> None:
         if event == "/jax/core/compile/backend_compile_duration":
             seen.append(duration_secs)
 
-    jax.clear_caches()
-    jax.monitoring.register_event_duration_secs_listener(count)
-    seconds, outside, compilations = [], [], []
+    jax.monitoring.register_event_duration_secs_listener(listen)
     try:
-        with tempfile.TemporaryDirectory() as scratch, RunDirectory(Path(scratch) / "run", config) as run:
-            state = algorithm.init(config)
-            while not algorithm.finished(config, state):
-                tell(f"outer iteration {state.iteration + 1} of {config.iterations}")
-                before, start = len(seen), time.perf_counter()
-                state, row = algorithm.step(config, state)
-                run.save(state, row)
-                seconds.append(time.perf_counter() - start)
-                stages = sum(value for name, value in row.items() if name.startswith("seconds_"))
-                outside.append(1 - stages / seconds[-1])
-                compilations.append(len(seen) - before)
+        yield seen
     finally:
-        jax.monitoring.unregister_event_duration_listener(count)
-    tell("starting a process")
-    return Iterations(seconds, outside, compilations, _start_to_imagined())
+        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 _START = """

@@ -105,7 +105,7 @@ def _product(x: Array, weights: Array) -> Array:
 
 @jax.custom_vjp
 def _bfloat16_product(x: Array, weights: Array) -> Array:
-    return _member_by_member(x.astype(jnp.bfloat16), weights)
+    return _forward(x, weights)[0]
 
 
 def _forward(x: Array, weights: Array) -> tuple[Array, tuple[Array, Array]]:

@@ -79,12 +79,11 @@ def improve(policy: Policy, batch: Batch, config: TRPOConfig, axis: str | None =
     )
     flat, unravel = ravel_pytree(policy)
     gradient = ravel_pytree(across(slope, axis))[0]
-    every = config.fisher_every
-    sample = (at, mask)
-    if every > 1:
-        fewer = chunked(batch.mask[::every])
-        sample = (linearise(policy.layers, chunked(batch.states[::every])), fewer)
-    product = fisher_product(policy, *sample, config.damping, axis)
+    if (every := config.fisher_every) > 1:
+        at_sample, sampled = linearise(policy.layers, chunked(batch.states[::every])), chunked(batch.mask[::every])
+    else:
+        at_sample, sampled = at, mask
+    product = fisher_product(policy, at_sample, sampled, config.damping, axis)
     direction, residual = conjugate_gradient(
         lambda v: ravel_pytree(product(unravel(v)))[0], gradient, config.cg_iterations
     )

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import importlib
 import platform
-from collections import Counter
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 
 from metrpo.run import video
 from metrpo.run.files import metrpo_version
-from metrpo.run.machine import INSTALL_GPU, cores, has_nvidia
+from metrpo.run.machine import INSTALL_GPU, cores, device_names, has_nvidia
 
 NEEDED = ("jax", "jaxlib", "mujoco", "gymnasium", "numpy", "optax")
 
@@ -60,11 +59,8 @@ def diagnose() -> Diagnosis:
 
 
 def _look_for_devices(found: Diagnosis) -> None:
-    import jax
-
     try:
-        names = Counter(f"{device.platform}: {device.device_kind}" for device in jax.devices())
-        found.devices = [name if count == 1 else f"{count} x {name}" for name, count in names.items()]
+        found.devices = device_names()
     except RuntimeError as error:
         found.problems.append(f"JAX finds no device ({error}): unset JAX_PLATFORMS or use --device cpu")
     if has_nvidia() and not any(device.startswith("gpu") for device in found.devices):

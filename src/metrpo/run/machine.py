@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections import Counter
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
@@ -35,8 +36,7 @@ def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
     elif "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         _add_flags(f"--xla_force_host_platform_device_count={min(cores(), MAX_CPU_DEVICES)}")
-    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(caches / "metrpo" / "jax"))
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     if device == "gpu":
@@ -45,6 +45,19 @@ def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
 
 def _add_flags(*flags: str) -> None:
     os.environ["XLA_FLAGS"] = " ".join([os.environ.get("XLA_FLAGS", ""), *flags]).strip()
+
+
+def cache_folder() -> Path:
+    """Where metrpo keeps what can be made again: metrpo in the user's cache directory."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "metrpo"
+
+
+def device_names() -> list[str]:
+    """JAX's devices, equal ones counted: ["2 x cpu: cpu"]. Raises JAX's `RuntimeError` where there is none."""
+    import jax
+
+    names = Counter(f"{device.platform}: {device.device_kind}" for device in jax.devices())
+    return [name if count == 1 else f"{count} x {name}" for name, count in names.items()]
 
 
 def cores() -> int:
