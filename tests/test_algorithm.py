@@ -14,12 +14,13 @@ import pytest
 
 import probe
 from helpers import linear_ensemble, random_ensemble, random_policy, slow_mean
-from metrpo import algorithm, phase
+from metrpo import algorithm, phase, training
 from metrpo.bench.report import compilations
 from metrpo.config import Config
 from metrpo.model.imagine import ImagineInfo, imagine
 from metrpo.policy import advantage, gaussian, trpo
-from metrpo.policy.trpo import ImproveInfo
+from metrpo.policy.batch import Batch, ImproveInfo
+from metrpo.policy.improve import Memory
 from metrpo.presets import override, preset
 from metrpo.run import clock as clock_module
 from metrpo.run.progress import SILENT, Progress
@@ -127,13 +128,13 @@ def test_train_is_init_and_steps(tiny):
         def end(self, row, seconds_left=None):
             told.append(without_clock(row))
 
-    state = algorithm.train(override(TINY, {"iterations": 2}), None, Told())
+    state = training.train(override(TINY, {"iterations": 2}), None, Told())
     assert equal(state, tiny.states[2])
     assert told == [(1, 2), without_clock(tiny.rows[0]), (2, 2), without_clock(tiny.rows[1])]
 
 
 def test_a_budget_of_real_steps_is_spent_and_no_more():
-    state = algorithm.train(override(TINY, {"real_steps": 41}))
+    state = training.train(override(TINY, {"real_steps": 41}))
     assert (state.iteration, state.real_steps) == (2, 80)
 
 
@@ -149,7 +150,7 @@ def test_a_budget_of_real_steps_is_spent_and_no_more():
 )
 def test_finished(tiny, budget, iteration, real_steps, finished):
     state = tiny.states[0]._replace(iteration=iteration, real_steps=real_steps)
-    assert algorithm.finished(override(TINY, budget), state) is finished
+    assert training.finished(override(TINY, budget), state) is finished
 
 
 def test_evaluation_reports_and_decides_nothing(tiny):
@@ -328,9 +329,9 @@ class Script:
         ensemble = random_ensemble(0, 2, 2, 2)
         return algorithm._improve(config, probe.PROBE, state, state.dataset, ensemble, 3, SILENT, clock)
 
-    def _updates(self, task, config, ensemble, policy, baseline, starts, key):
+    def _updates(self, task, config, ensemble, policy, memory, starts, key):
         count = len(starts)
-        assert np.all(np.asarray(baseline) == self.number(policy)), "baseline and policy go on together"
+        assert np.all(np.asarray(memory.baseline) == self.number(policy)), "baseline and policy go on together"
         self.blocks.append((self.number(policy), count))
         self.starts.append(starts)
         self.keys = [*getattr(self, "keys", []), tuple(np.asarray(jax.random.key_data(key)))]
@@ -338,7 +339,7 @@ class Script:
         moved = gaussian.Policy(((weights, biases + count),), policy.log_std - count)
         accepted = np.arange(count) > 0  # the line search rejects the first of each block
         infos = ImproveInfo(zeros + 0.25, zeros, accepted, zeros, zeros), ImagineInfo(zeros, zeros + 0.5, zeros)
-        return moved, baseline + count, infos
+        return moved, memory._replace(baseline=memory.baseline + count), infos
 
     def _validate(self, task, ensemble, policy, starts):
         self.fixed_starts.append(starts)
@@ -484,8 +485,8 @@ def test_a_block_of_updates_is_imagination_advantages_and_trpo_one_after_the_oth
     policy = jax.tree.map(jnp.asarray, random_policy(0, 2, 2, hidden=(4,), std=0.5))
     starts = np.random.default_rng(0).uniform(-0.7, 0.7, (2, 5, 2)).astype(np.float32)
     baseline, key = advantage.init_baseline(2) - 0.1, jax.random.key(3)
-    got_policy, got_baseline, (improved, imagined) = phase._updates(
-        probe.PROBE, TINY, ensemble, policy, baseline, starts, key
+    got_policy, (got_baseline, _), (improved, imagined) = phase._updates(
+        probe.PROBE, TINY, ensemble, policy, Memory(baseline, ()), starts, key
     )
 
     @jax.jit
@@ -493,7 +494,7 @@ def test_a_block_of_updates_is_imagination_advantages_and_trpo_one_after_the_oth
         act = partial(gaussian.sample, policy)
         t, info = imagine(ensemble, act, probe.reward, None, starts, probe.HORIZON, key)
         advantages, baseline = advantage.advantages_and_baseline(t, baseline, 1.0, 1.0, 1e-5)
-        batch = trpo.Batch(t.states, t.actions, advantages, t.mask)
+        batch = Batch(t.states, t.actions, advantages, t.mask)
         batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(100, *x.shape[2:]), batch)
         policy, improve_info = trpo.improve(policy, batch, TINY.trpo)
         return policy, baseline, improve_info, info, advantage.features(t.states)
@@ -546,7 +547,7 @@ def test_the_whole_loop_finds_the_optimum_of_the_probe():
     for seed in (0, 1):
         config = override(LEARN, {"seed": seed})
         before = real_return(algorithm.init(config).policy)
-        state = algorithm.train(config)
+        state = training.train(config)
         after = real_return(state.policy)
         assert state.real_steps == 600
         assert before < 4 * optimum
@@ -563,6 +564,6 @@ def test_swimmer_learns_to_swim():
         def end(self, row, seconds_left=None):
             returns.append(row["return_real"])
 
-    algorithm.train(preset("Swimmer", iterations=4), progress=Returns())
+    training.train(preset("Swimmer", iterations=4), progress=Returns())
     assert len(returns) == 4
     assert max(returns[-2:]) > 15

@@ -41,7 +41,7 @@ def a_state(iteration: int) -> State:
 
 
 def train(config: Config, run_dir: Path, progress: Any) -> None:
-    """Stands in for algorithm.train: learns nothing, but keeps its promises to the disk."""
+    """Stands in for training.train: learns nothing, but keeps its promises to the disk."""
     with RunDirectory(run_dir, config) as run:
         state = run.load(a_state(0)) or a_state(0)
         while state.iteration < config.iterations:
@@ -58,9 +58,9 @@ def train(config: Config, run_dir: Path, progress: Any) -> None:
 
 @pytest.fixture(autouse=True)
 def _stubs(monkeypatch, tmp_path):
-    stub = types.ModuleType("metrpo.algorithm")
+    stub = types.ModuleType("metrpo.training")
     stub.train = train  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "metrpo.algorithm", stub)
+    monkeypatch.setitem(sys.modules, "metrpo.training", stub)
     monkeypatch.setattr(directory, "draw_curve", lambda rows, path, title: None)
     monkeypatch.setattr("metrpo.evaluation.record", lambda make_env, policy, path, seed: path)
     monkeypatch.chdir(tmp_path)
@@ -258,7 +258,7 @@ def test_help_shows_the_defaults_of_task_and_preset(capsys):
 
 
 def test_every_public_name_is_there():
-    stub = sys.modules["metrpo.algorithm"]
+    stub = sys.modules["metrpo.training"]
     for name in ("State", "init", "step"):
         setattr(stub, name, None)
     assert [name for name in metrpo.__all__ if not hasattr(metrpo, name)] == []
@@ -326,13 +326,13 @@ def test_no_gpu_is_one_message(capsys, monkeypatch):
 STOPPED = """
 import signal, sys, time, types
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what runs in its background
-stub = types.ModuleType("metrpo.algorithm")
+stub = types.ModuleType("metrpo.training")
 def train(config, run_dir, progress):
     progress.begin(1, 2)
     print("training", flush=True)
     time.sleep(60)
 stub.train = train
-sys.modules["metrpo.algorithm"] = stub
+sys.modules["metrpo.training"] = stub
 from metrpo.cli import main
 sys.exit(main(["train", "Swimmer", "--run-dir", "a"]))
 """

@@ -125,6 +125,14 @@ IMPOSSIBLE = {
     "trpo.damping": [-1e-5, float("nan")],
     "trpo.backtrack_ratio": [0.0, 1.0, 1.5, float("nan")],
     "trpo.max_backtracks": [0],
+    "gradient.learning_rate": [0.0, -1e-3, float("nan"), float("inf")],
+    "gradient.max_norm": [0.0, -1.0, float("nan")],
+    "ppo.clip": [0.0, 1.0, float("nan")],
+    "ppo.epochs": [0],
+    "ppo.minibatches": [0],
+    "svg.model_steps": [0],
+    "svg.value_steps": [0],
+    "svg.value_learning_rate": [0.0, float("nan")],
     "validate.every": [0],
     "validate.threshold": [-0.1, 1.1, float("nan")],
     "validate.patience": [0],
@@ -132,7 +140,7 @@ IMPOSSIBLE = {
     "validate.starts": [0],
 }
 FREE = {"preset", "improver", "deterministic", "collect.std_per", "fit.loss_units", "imagine.sampling", "imagine.start"}
-FREE |= {"validate.rule", "fit.products", "imagine.products"}
+FREE |= {"validate.rule", "fit.products", "imagine.products", "system", "method", "svg.horizon"}
 
 
 def test_every_number_has_its_impossible_values_listed_here():

@@ -41,6 +41,7 @@ np.savez(OUT, *jax.tree.leaves(fitted), *jax.tree.leaves(info))
 IMPROVE = """
 from metrpo.config import TRPOConfig
 from metrpo.policy import advantage, trpo
+from metrpo.policy.batch import Batch
 from metrpo.types import Trajectories
 rng = np.random.default_rng(0)
 policy = random_policy(0, 4, 2, hidden=(8,))
@@ -53,7 +54,7 @@ def work(policy, baseline, *given):
     t = Trajectories(*given)
     advantages, baseline = advantage.advantages_and_baseline(t, baseline, 0.9, 0.9, 0.1, "rollouts")
     flat = [jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]) for x in (t.states, t.actions, advantages, t.mask)]
-    return advantages, baseline, trpo.improve(policy, trpo.Batch(*flat), TRPOConfig(damping=0.1), "rollouts")
+    return advantages, baseline, trpo.improve(policy, Batch(*flat), TRPOConfig(damping=0.1), "rollouts")
 
 share = P(None, "rollouts")
 specs = {"in_specs": (P(), P(), share, share, share, share), "out_specs": (share, P(), P())}

@@ -59,7 +59,7 @@ def a_row(iteration: int) -> dict[str, Any]:
 
 
 def train(path: Path, config: Config = CONFIG, until: int = 5) -> list[int]:
-    """What algorithm.train does with a directory; returns the iterations it ran."""
+    """What training.train does with a directory; returns the iterations it ran."""
     ran = []
     with RunDirectory(path, config) as run:
         state = run.load(a_state()) or a_state()

@@ -14,7 +14,7 @@ import probe
 from helpers import linear_ensemble, on_host, random_ensemble, random_normaliser, random_policy, slow_delta, slow_mean
 from metrpo.model import imagine as imagining
 from metrpo.model.ensemble import Ensemble
-from metrpo.model.imagine import imagine, model_choice, returns_per_model, step_rand
+from metrpo.model.imagine import Keys, imagine, model_choice, returns_per_model, step_rand
 from metrpo.policy import gaussian
 
 KEY = jax.random.key(0)
@@ -277,7 +277,7 @@ def test_step_rand_is_compute_all_then_pick(count, members):
     everything = np.array([[s + slow_delta(ensemble, k, s, a) for s, a in zip(states, actions, strict=True)]
                            for k in range(members)])  # fmt: skip
     picked = everything[np.asarray(models), np.arange(count)]
-    np.testing.assert_allclose(jax.jit(step_rand)(ensemble, states, actions, KEY), picked, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(step_rand)(ensemble, states, actions, Keys(KEY, KEY)), picked, atol=1e-5)
 
 
 def test_the_sampling_stands_in_the_table():

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
+import typing
+
 import pytest
 
-from metrpo.config import Config, flatten, from_json, to_json
+from metrpo import systems
+from metrpo.config import Config, System, flatten, from_json, to_json
 from metrpo.errors import ConfigError
 from metrpo.presets import preset
+from metrpo.systems import SYSTEMS
 from metrpo.world.task import tasks
 
 TASKS = ["Swimmer", "Snake", "Hopper", "HopperUpright", "HalfCheetah", "Ant", "Humanoid", "HumanoidStandup"]
@@ -84,6 +89,13 @@ OURS = {
     "deterministic": (False, "how the machine computes, not what"),
     "fit.weight_decay": (0.0, "an option of `fast`; the paper knows none, so it is off"),
     "fit.max_steps": (None, "an option of `fast`; the paper knows none, so it is off"),
+    "system": ("me-trpo", "the label"),
+    "method": ("model-based", "the paper's own"),
+    **{
+        f"{section}.{name}": (value, "used by the systems that the paper compares with, not by me-trpo")
+        for section in ("gradient", "ppo", "svg")
+        for name, value in vars(getattr(Config("x"), section)).items()
+    },
     "validate.max_updates": (400, "a bound that keeps one phase from running forever"),
 }
 
@@ -146,3 +158,28 @@ def test_an_unknown_preset_is_refused():
         preset("Swimmer", "quick")
     with pytest.raises(ConfigError, match="unknown setting 'colour'"):
         preset("Swimmer", colour=1)
+
+
+def test_every_system_that_can_be_named_stands_in_the_table():
+    assert tuple(SYSTEMS) == typing.get_args(System)
+    assert set(systems.PAPER) <= set(SYSTEMS)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.parametrize("name", ["fast", "paper"])
+def test_a_system_changes_what_its_row_says_and_nothing_else(system, name):
+    config = preset("Swimmer", name, system)
+    row = SYSTEMS[system] | (systems.PAPER.get(system, {}) if name == "paper" else {})
+    before = flatten(preset("Swimmer", name))
+    assert flatten(config) == before | row | {"system": system}
+    assert from_json(to_json(config)) == config
+
+
+def test_the_papers_systems_differ_from_each_other():
+    configs = [dataclasses.replace(preset("Swimmer", "paper", s), system="me-trpo") for s in SYSTEMS]
+    assert len(set(configs)) == len(SYSTEMS)
+
+
+def test_an_unknown_system_is_refused_with_the_known_ones():
+    with pytest.raises(ConfigError, match=r"system: expected one of me-trpo, .*svg-inf, got 'a3c'"):
+        preset("Swimmer", "fast", "a3c")

@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 from helpers import on_host, random_policy, slow_mean
 from metrpo.config import TRPOConfig
 from metrpo.policy import gaussian, trpo
+from metrpo.policy.batch import Batch
 from metrpo.policy.linearised import chunked, linearise
 
 COUNT, STATE, ACTION = 24, 4, 2
@@ -32,7 +33,7 @@ def a_batch(seed, policy, share=0.7):
     means = np.array([slow_mean(policy, s) for s in states])
     actions = (means + np.exp(policy.log_std) * rng.normal(size=means.shape)).astype(np.float32)
     mask = (rng.uniform(size=COUNT) < share).astype(np.float32)
-    return trpo.Batch(states, actions, mask * rng.normal(size=COUNT).astype(np.float32), mask)
+    return Batch(states, actions, mask * rng.normal(size=COUNT).astype(np.float32), mask)
 
 
 def slow_surrogate_and_kl(old, new, batch):
@@ -145,7 +146,7 @@ def test_a_gaussian_bandit_moves_as_the_closed_form_says():
     """No state, one action, std 1: F is 1 for the mean, g the mean of z A; the first try lands on KL = max_kl."""
     policy = gaussian.Policy(((np.zeros((1, 1), np.float32), np.zeros(1, np.float32)),), np.zeros(1, np.float32))
     actions = np.array([[-1.0], [1.0], [-1.0], [1.0]], np.float32)
-    batch = trpo.Batch(np.zeros((4, 1), np.float32), actions, actions[:, 0], np.ones(4, np.float32))
+    batch = Batch(np.zeros((4, 1), np.float32), actions, actions[:, 0], np.ones(4, np.float32))
     new, info = improve(policy, batch, TRPOConfig(max_kl=0.02, damping=0.0, max_backtracks=2))
     # z^2 - 1 = 0 for every action: the gradient of log_std vanishes, and the mean goes up by sqrt(2 max_kl).
     tries = int(info.backtracks)
@@ -234,7 +235,7 @@ def test_masked_steps_have_no_influence():
     policy = random_policy(3, hidden=(5,))
     batch = a_batch(4, policy)
     off = batch.mask == 0
-    dirty = trpo.Batch(
+    dirty = Batch(
         np.where(off[:, None], 1e5, batch.states).astype(np.float32),
         np.where(off[:, None], -3e3, batch.actions).astype(np.float32),
         np.where(off, 1e6, batch.advantages).astype(np.float32),
@@ -248,7 +249,7 @@ def test_masked_steps_have_no_influence():
         np.testing.assert_array_equal(ours, theirs)
     # and the means are over the steps that count: leaving the others out gives the same
     # (well damped, for sums in another order lead elsewhere where F is nearly singular).
-    kept, damped = trpo.Batch(*(x[~off] for x in batch)), TRPOConfig(damping=0.1)
+    kept, damped = Batch(*(x[~off] for x in batch)), TRPOConfig(damping=0.1)
     clean, _ = improve(policy, batch, damped)
     for ours, theirs in zip(jax.tree.leaves(improve(policy, kept, damped)[0]), jax.tree.leaves(clean), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-4)

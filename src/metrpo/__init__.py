@@ -17,11 +17,12 @@ from metrpo.config import Config
 from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError, TaskError
 
 if TYPE_CHECKING:
-    from metrpo.algorithm import State, init, step, train
+    from metrpo.algorithm import State
     from metrpo.evaluation import EvaluationResult, evaluate, render
     from metrpo.presets import preset
     from metrpo.run.metrics import read_metrics
     from metrpo.run.policy_file import LoadedPolicy, load_policy
+    from metrpo.training import init, step, train
     from metrpo.world.task import Task, get_task, tasks
 
 __all__ = [
@@ -48,11 +49,12 @@ __all__ = [
 
 # Imported at first use: a policy can be loaded without JAX, and `import metrpo` costs next to nothing.
 _HOME = {
-    "metrpo.algorithm": ("State", "init", "step", "train"),
+    "metrpo.algorithm": ("State",),
     "metrpo.evaluation": ("EvaluationResult", "evaluate", "render"),
     "metrpo.presets": ("preset",),
     "metrpo.run.metrics": ("read_metrics",),
     "metrpo.run.policy_file": ("LoadedPolicy", "load_policy"),
+    "metrpo.training": ("init", "step", "train"),
     "metrpo.world.task": ("Task", "get_task", "tasks"),
 }
 

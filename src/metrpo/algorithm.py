@@ -5,23 +5,18 @@
         fit       every model of the ensemble to the dataset                    model/fit.py
         repeat:
             imagine   rollouts through the ensemble with the policy             model/imagine.py
-            improve   the policy on them by TRPO                                policy/advantage.py, policy/trpo.py
+            improve   the policy on them, by TRPO                               policy/improve.py, policy/trpo.py
             validate  the policy in each model                                  policy/validate.py
         until the models no longer agree that it improves
     until the budget is spent
 
-`step` is one turn of the outer loop and reads like it. All randomness derives from (seed, iteration, stage), so a run
-resumed at an iteration boundary is the same run.
+`step` is one turn of the outer loop and reads like it; `metrpo.training` repeats it until the budget is spent.
 """
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable, Mapping
 from functools import partial
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -35,8 +30,8 @@ from metrpo.phase import PhaseInfo
 from metrpo.policy import advantage, gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.run.clock import Clock
-from metrpo.run.directory import RunDirectory
 from metrpo.run.progress import SILENT, Progress
+from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.types import Array
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
@@ -45,9 +40,6 @@ from metrpo.world.task import Task, get_task
 
 Row = dict[str, float | int]
 """One iteration's metrics, in the order of metrics.csv's columns."""
-
-INIT, COLLECT, FIT, IMPROVE, EVALUATE = range(5)
-"""Stages, for deriving their randomness."""
 
 
 class State(NamedTuple):
@@ -69,7 +61,7 @@ class State(NamedTuple):
 def init(config: Config) -> State:
     """The state before the first iteration."""
     task = get_task(config.task)
-    policy_key, ensemble_key = jax.random.split(_key(config, 0, INIT))
+    policy_key, ensemble_key = jax.random.split(key_of(config.seed, 0, Stage.INIT))
     policy = gaussian.init(
         policy_key, task.state_size, task.action_size, config.policy.hidden, config.policy.initial_std
     )
@@ -91,7 +83,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
     clock = Clock()
     with clock("collect"):
         progress.stage("collect", config.collect.steps)
-        rng = _rng(config, iteration, COLLECT)
+        rng = rng_of(config.seed, iteration, Stage.COLLECT)
         actor = partial(_perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise)
         episodes = real.collect(task, actor, config.collect, rng, progress.update)
         dataset = datasets.add(state.dataset, episodes, config.collect, rng)
@@ -103,8 +95,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
         policy, baseline, improved = _improve(config, task, state, dataset, ensemble, iteration, progress, clock)
     with clock("evaluate"):
         progress.stage("evaluate", config.evaluation_episodes)
-        seed = int(_rng(config, iteration, EVALUATE).integers(2**31))
-        returns = real.evaluate(task, partial(gaussian.mean, _host(policy)), config.evaluation_episodes, seed)
+        returns = evaluate(config, task, policy, iteration)
     state = State(
         iteration=iteration,
         real_steps=state.real_steps + sum(len(e.rewards) for e in episodes),
@@ -118,57 +109,10 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
     return state, _row(state, returns, collected, fitted, improved, clock)
 
 
-def train(config: Config, run_dir: str | Path | None = None, progress: Progress = SILENT) -> State:
-    """Runs the loop until the budget is spent and returns the last state.
-
-    With `run_dir`, every iteration is saved there; a run found there is resumed, exactly as if it had never stopped.
-
-    Raises `TaskError` for an unknown task and `RunDirectoryError` when `run_dir` cannot be used (see `RunDirectory`).
-    """
-    template = init(config)
-    if run_dir is None:
-        return _loop(config, template, progress, lambda state, row: row)
-    with RunDirectory(run_dir, config) as run:
-        return _loop(config, run.load(template) or template, progress, run.save)
-
-
-def _loop(config: Config, state: State, progress: Progress, save: Callable[[State, Row], Mapping[str, Any]]) -> State:
-    seconds: list[float] = []
-    try:
-        while not finished(config, state):
-            started = time.monotonic()
-            left = _iterations_left(config, state)
-            progress.begin(state.iteration + 1, None if left is None else state.iteration + left)
-            state, row = step(config, state, progress)
-            written = save(state, row)
-            # Of the last three: iterations grow with the data, and the first one compiled.
-            seconds = [*seconds, time.monotonic() - started][-3:]
-            left = _iterations_left(config, state)
-            progress.end(written, None if left is None else left * float(np.mean(seconds)))
-    finally:
-        progress.close()
-    return state
-
-
-def _iterations_left(config: Config, state: State) -> int | None:
-    if config.real_steps is None:
-        return config.iterations - state.iteration
-    if not state.iteration:
-        return None
-    return math.ceil((config.real_steps - state.real_steps) / (state.real_steps / state.iteration))
-
-
-def finished(config: Config, state: State) -> bool:
-    """Whether the budget, iterations or real steps, is spent."""
-    if config.real_steps is not None:
-        return state.real_steps >= config.real_steps
-    return state.iteration >= config.iterations
-
-
 def _fit(
     config: Config, task: Task, networks: Networks, dataset: Dataset, iteration: int, progress: Progress
 ) -> tuple[Ensemble, FitInfo]:
-    init_key, fit_key = jax.random.split(_key(config, iteration, FIT))
+    init_key, fit_key = jax.random.split(key_of(config.seed, iteration, Stage.FIT))
     every = config.fit.reinitialise_every
     if every and (iteration - 1) % every == 0:
         networks = _fresh_networks(config, task, init_key)
@@ -193,7 +137,7 @@ def _improve(
     progress: Progress,
     clock: Clock,
 ) -> tuple[Policy, Array, PhaseInfo]:
-    rng, starts = _rng(config, iteration, IMPROVE), dataset.starts
+    rng, starts = rng_of(config.seed, iteration, Stage.IMPROVE), dataset.starts
     if config.imagine.start == "reset":
         starts = real.reset_states(task, max(config.validate.starts, phase.rollouts(config, task)), rng)
     return phase.improve(
@@ -204,10 +148,17 @@ def _improve(
         state.baseline,
         starts,
         rng,
-        _key(config, iteration, IMPROVE),
+        key_of(config.seed, iteration, Stage.IMPROVE),
         clock,
         lambda updates, accepted, value: progress.update(updates, f"accepted {accepted}, imagined return {value:.2f}"),
+        lambda policy: float(np.mean(evaluate(config, task, policy, iteration))),
     )
+
+
+def evaluate(config: Config, task: Task, policy: Policy, iteration: int) -> np.ndarray:
+    """Real returns [config.evaluation_episodes] of the deterministic policy: a record, never used to learn."""
+    seed = int(rng_of(config.seed, iteration, Stage.EVALUATE).integers(2**31))
+    return real.evaluate(task, partial(gaussian.mean, _host(policy)), config.evaluation_episodes, seed)
 
 
 def _perturbed(policy: Policy, previous: Policy, scale: float, rng: np.random.Generator) -> real.Act:
@@ -255,11 +206,3 @@ def _fresh_networks(config: Config, task: Task, key: Array) -> Networks:
 
 def _host(policy: Policy) -> Policy:
     return jax.tree.map(np.asarray, policy)
-
-
-def _key(config: Config, iteration: int, stage: int) -> Array:
-    return jax.random.fold_in(jax.random.fold_in(jax.random.key(config.seed), iteration), stage)
-
-
-def _rng(config: Config, iteration: int, stage: int) -> np.random.Generator:
-    return np.random.default_rng([config.seed, iteration, stage])

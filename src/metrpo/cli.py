@@ -49,11 +49,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _train(command: Train) -> int:
-    from metrpo.algorithm import train
     from metrpo.run.progress import default_progress
+    from metrpo.training import train
 
     config = Config(**{f.name: getattr(command, f.name) for f in dataclasses.fields(Config)})
-    run_dir = command.run_dir or Path("runs") / f"{config.task}-{config.preset}-seed{config.seed}"
+    system = "" if config.system == "me-trpo" else f"{config.system}-"
+    run_dir = command.run_dir or Path("runs") / f"{config.task}-{system}{config.preset}-seed{config.seed}"
     signal.signal(signal.SIGTERM, _terminate)
     progress = default_progress()
     try:

@@ -118,8 +118,9 @@ class ImagineConfig:
 
     steps: int = 50_000
     """Imagined steps per policy update (TRPO's batch)."""
-    sampling: Literal["step_rand"] = "step_rand"
-    """How the next state comes out of the ensemble; step_rand: one model drawn per state and step."""
+    sampling: Literal["step_rand", "model_mean_std", "model_mean", "model_med", "eps_rand", "one_model"] = "step_rand"
+    """How the next state comes out of the ensemble: of a model drawn per step (step_rand) or per episode (eps_rand), of
+    the first model, the models' mean or median, or drawn from a normal distribution fitted to them."""
     start: Literal["dataset", "reset"] = "dataset"
     """Start states of imagined episodes: those of real episodes in the dataset, or fresh real resets (uncounted)."""
     products: Literal["float32", "bfloat16"] = "float32"
@@ -189,11 +190,63 @@ class TRPOConfig:
 
 
 @dataclass(frozen=True)
+class GradientConfig:
+    """Adam on the policy's parameters, for every improver but TRPO."""
+
+    learning_rate: float = 3e-4
+    """Adam's step size."""
+    max_norm: float = 10.0
+    """A gradient longer than this is shortened to it (for SVG: the paper, appendix A.2.1)."""
+
+    def __post_init__(self) -> None:
+        _require(_positive(self.learning_rate), "gradient.learning_rate", self.learning_rate, "a finite number > 0")
+        _require(self.max_norm > 0, "gradient.max_norm", self.max_norm, "a number > 0")
+
+
+@dataclass(frozen=True)
+class PPOConfig:
+    """Proximal policy optimization in imagination (Schulman et al. 2017), for `improver = "ppo"`."""
+
+    clip: float = 0.2
+    """Probability ratios beyond 1 +- clip earn nothing more."""
+    epochs: int = 10
+    """Passes over the batch per policy update."""
+    minibatches: int = 32
+    """Parts that the batch is cut into in every pass, one gradient step each."""
+
+    def __post_init__(self) -> None:
+        _require(0 < self.clip < 1, "ppo.clip", self.clip, "between 0 and 1, both excluded")
+        _require(self.epochs >= 1, "ppo.epochs", self.epochs, "at least 1")
+        _require(self.minibatches >= 1, "ppo.minibatches", self.minibatches, "at least 1")
+
+
+@dataclass(frozen=True)
+class SVGConfig:
+    """Stochastic value gradients (Heess et al. 2015), for `method = "svg"`."""
+
+    horizon: Literal["inf", "1"] = "inf"
+    """SVG(inf): through the model along the whole real episode; SVG(1): through one step, then a learned value."""
+    model_steps: int = 200
+    """Minibatches after every episode, from all data so far."""
+    value_steps: int = 50
+    """SVG(1): gradient steps of the value network after every episode, on its own returns."""
+    value_learning_rate: float = 1e-3
+    """SVG(1): Adam's step size for the value network."""
+
+    def __post_init__(self) -> None:
+        _require(self.model_steps >= 1, "svg.model_steps", self.model_steps, "at least 1")
+        _require(self.value_steps >= 1, "svg.value_steps", self.value_steps, "at least 1")
+        rate = self.value_learning_rate
+        _require(_positive(rate), "svg.value_learning_rate", rate, "a finite number > 0")
+
+
+@dataclass(frozen=True)
 class ValidateConfig:
     """When to stop improving the policy (paper, section 5, "Policy validation")."""
 
-    rule: Literal["ensemble"] = "ensemble"
-    """Who decides; ensemble: each model votes whether the policy improved on the last accepted one."""
+    rule: Literal["ensemble", "one_model", "real", "trpo_mean", "no_early"] = "ensemble"
+    """Who says whether the policy improved on the last accepted one: each model votes (ensemble), the first model, the
+    real environment (an oracle; its steps are not counted), the updates' rollouts, or nobody: go on to max_updates."""
     every: int = 5
     """Policy updates between two validations."""
     threshold: float = 0.7
@@ -211,6 +264,34 @@ class ValidateConfig:
         _require(0 <= self.threshold <= 1, "validate.threshold", self.threshold, "between 0 and 1")
 
 
+System = Literal[
+    "me-trpo",
+    "k-1",
+    "k-10",
+    "k-20",
+    "model-ppo",
+    "model-vpg",
+    "bptt",
+    "bptt-stochastic",
+    "model_mean_std",
+    "model_mean",
+    "model_med",
+    "eps_rand",
+    "one_model",
+    "validate-real",
+    "validate-trpo_mean",
+    "validate-no_early_50",
+    "validate-no_early_5",
+    "validate-one_model",
+    "trpo",
+    "ppo",
+    "ddpg",
+    "svg-1",
+    "svg-inf",
+]
+"""Names of the systems that the paper compares."""
+
+
 @dataclass(frozen=True)
 class Config:
     """One run, whole: what `config.json` in a run directory holds."""
@@ -225,8 +306,14 @@ class Config:
     """Outer iterations; may be raised later to go on with a finished run."""
     real_steps: int | None = None
     """Instead of `iterations`: go on until this many real steps have been collected."""
-    improver: Literal["trpo"] = "trpo"
-    """How the policy is improved."""
+    system: System = "me-trpo"
+    """Which of the paper's systems the values describe (see `metrpo.systems`); a label, the values themselves count."""
+    method: Literal["model-based", "trpo", "ppo", "ddpg", "svg"] = "model-based"
+    """The loop: in the ensemble (the paper's Algorithms 1 and 2), or a baseline in the real environment: TRPO,
+    Stable-Baselines3's PPO and DDPG, stochastic value gradients."""
+    improver: Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic"] = "trpo"
+    """How the policy is improved in the ensemble: by the score function (trpo, ppo, vpg) or by backpropagation through
+    the models, of the mean action or of reparametrised samples."""
     evaluation_episodes: int = 20
     """Real episodes of the deterministic policy that `return_real` averages; a report, never used to learn."""
     deterministic: bool = False
@@ -238,6 +325,9 @@ class Config:
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     advantage: AdvantageConfig = field(default_factory=AdvantageConfig)
     trpo: TRPOConfig = field(default_factory=TRPOConfig)
+    gradient: GradientConfig = field(default_factory=GradientConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    svg: SVGConfig = field(default_factory=SVGConfig)
     validate: ValidateConfig = field(default_factory=ValidateConfig)
 
     def __post_init__(self) -> None:
@@ -251,7 +341,16 @@ class Config:
 BUDGET_FIELDS = ("iterations", "real_steps")
 """Fields that say how long to run, not what is run: they may change when a run is resumed."""
 
-ADDED = ("config.fit.products", "config.imagine.products", "config.trpo.fisher_every")
+ADDED = (
+    "config.fit.products",
+    "config.imagine.products",
+    "config.trpo.fisher_every",
+    "config.system",
+    "config.method",
+    "config.gradient",
+    "config.ppo",
+    "config.svg",
+)
 """Settings newer than the first config.json files: where one is missing, its default is what was done then."""
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, cast
 import tyro
 from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from metrpo.config import Config
+from metrpo.config import Config, System
 from metrpo.errors import ConfigError
 
 _BUDGET = tyro.conf.create_mutex_group(required=False)
@@ -24,6 +24,7 @@ class Train(Config):
     Every setting below starts from the task's preset. For example:
         metrpo train Swimmer
         metrpo train HalfCheetah --seed 1 --real-steps 60000 --run-dir runs/cheetah
+        metrpo train Swimmer --system ppo
         metrpo train Swimmer --preset paper --ensemble.members 10 --trpo.max-kl 0.02 --ensemble.hidden 512 512
     """
 
@@ -31,12 +32,14 @@ class Train(Config):
     """Name of the task (see: metrpo tasks)."""
     preset: Literal["fast", "paper"] = "fast"
     """What all other settings start from: the paper's values, or what learns soonest on two CPU cores."""
+    system: System = "me-trpo"
+    """Which of the paper's systems: they differ from me-trpo in a few settings each (see metrpo.systems)."""
     iterations: Annotated[int, _BUDGET] = 10
     """Outer iterations; may be raised later to go on with a finished run."""
     real_steps: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
     """Instead of --iterations: go on until this many real steps have been collected."""
     run_dir: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Where the run lives; default: runs/<task>-<preset>-seed<seed>."""
+    """Where the run lives; default: runs/<task>-[<system>-]<preset>-seed<seed>."""
     device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="{cpu,gpu}")] = None
     """Where JAX computes; default: a GPU if JAX can use one."""
 
@@ -156,7 +159,7 @@ def parse(arguments: list[str]) -> Command:
     from metrpo.world.task import get_task
 
     task = get_task(first.task).name
-    parsed = _with_defaults(_defaults(preset(task, first.preset)), arguments)
+    parsed = _with_defaults(_defaults(preset(task, first.preset, first.system)), arguments)
     return dataclasses.replace(cast(Train, parsed), task=task)
 
 

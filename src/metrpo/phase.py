@@ -11,7 +11,6 @@ from functools import partial
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
@@ -19,10 +18,12 @@ from metrpo import devices
 from metrpo.config import Config
 from metrpo.model.ensemble import Ensemble, with_products
 from metrpo.model.imagine import ImagineInfo, imagine, returns_per_model
-from metrpo.policy import advantage, gaussian, trpo
+from metrpo.policy import gaussian
+from metrpo.policy.batch import ImproveInfo
 from metrpo.policy.gaussian import Policy
-from metrpo.policy.validate import RULES
-from metrpo.types import Array
+from metrpo.policy.improve import IMPROVERS, Memory, init_memory
+from metrpo.policy.validate import RULES, Evidence, fraction_improved
+from metrpo.types import Act, Array, Trajectories
 from metrpo.world.task import Task
 
 AXIS = "rollouts"
@@ -38,10 +39,10 @@ class PhaseInfo(NamedTuple):
     accepted_updates: int
     """Updates up to the accepted policy."""
     rejected_steps: int
-    """Updates that the line search rejected."""
+    """Updates that moved nothing: rejected by the line search, or with a gradient that was not finite."""
     validations: int
     fraction_improved: float
-    """Mean over the validations."""
+    """Share of the models that value a policy above the accepted one, whatever the rule; mean over the validations."""
     kl: float
     """Mean over the updates."""
     diverged: float
@@ -59,40 +60,48 @@ def improve(
     key: Array,
     clock: Callable[[str], AbstractContextManager[None]],
     on_validation: Callable[[int, int, float], None],
+    oracle: Callable[[Policy], float],
 ) -> tuple[Policy, Array, PhaseInfo]:
-    """Improves `policy` by TRPO in the ensemble and returns the last accepted policy, the baseline and what happened.
+    """Improves `policy` in the ensemble and returns the last accepted policy, the baseline and what happened.
 
     Updates come in blocks of `config.validate.every`, each validated on the same start states. Imagined episodes start
     in states drawn from `pool` [E, S] by `rng`; `on_validation(updates, updates accepted, value)` follows every one.
+    `oracle` gives a policy's real return, for the rule that asks for it.
     """
     rule = RULES[config.validate.rule]
     ensemble = ensemble._replace(networks=with_products(ensemble.networks, config.imagine.products))
     fixed_starts = pool[rng.integers(len(pool), size=config.validate.starts)]
-    accepted, reference = policy, values_of(task, ensemble, policy, fixed_starts)
+
+    def judge(policy: Policy, imagined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values = values_of(task, ensemble, policy, fixed_starts)
+        return values, rule.evidence(Evidence(values, imagined, partial(oracle, policy)))
+
+    memory = init_memory(config, policy, baseline)
+    accepted, (values, reference) = policy, judge(policy, np.array([-np.inf]))
     updates = accepted_at = 0
-    infos: list[tuple[trpo.ImproveInfo, ImagineInfo]] = []
+    infos: list[tuple[ImproveInfo, ImagineInfo]] = []
     fractions: list[float] = []
     while updates - accepted_at < config.validate.patience and updates < config.validate.max_updates:
         block = min(config.validate.every, config.validate.max_updates - updates)
         starts = pool[rng.integers(len(pool), size=(block, rollouts(config, task)))]
-        policy, baseline, info = _updates(
-            task, config, ensemble, policy, baseline, starts, jax.random.fold_in(key, updates)
+        policy, memory, info = _updates(
+            task, config, ensemble, policy, memory, starts, jax.random.fold_in(key, updates)
         )
         infos.append(jax.device_get(info))
         updates += block
         with clock("validate"):
-            values = values_of(task, ensemble, policy, fixed_starts)
-        verdict = rule(values, reference, config.validate)
-        fractions.append(verdict.fraction_improved)
-        if verdict.accepted:
-            accepted, reference, accepted_at = policy, values, updates
-        on_validation(updates, accepted_at, float(np.mean(reference)))
+            new_values, evidence = judge(policy, infos[-1][1].mean_return[-1:])
+        verdict = rule.decide(evidence, reference, config.validate)
+        fractions.append(fraction_improved(new_values, values))
+        if verdict:
+            accepted, values, reference, accepted_at = policy, new_values, evidence, updates
+        on_validation(updates, accepted_at, float(np.mean(values)))
     improve_info, imagine_info = jax.tree.map(lambda *xs: np.concatenate(xs), *infos)
     return (
         accepted,
-        baseline,
+        memory.baseline,
         PhaseInfo(
-            values=reference,
+            values=values,
             updates=updates,
             accepted_updates=accepted_at,
             rejected_steps=int(np.sum(~improve_info.accepted)),
@@ -116,42 +125,28 @@ def _compiled_updates(
     mesh: Mesh,
     ensemble: Ensemble,
     policy: Policy,
-    baseline: Array,
+    memory: Memory,
     starts: Array,
     keys: Array,
-) -> tuple[Policy, Array, tuple[trpo.ImproveInfo, ImagineInfo]]:
+) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
     """Policy updates in one compiled call, one for each batch of start states [updates, N, S], shared by `mesh`."""
+    improver = IMPROVERS[config.improver]
 
     def updates(
-        ensemble: Ensemble, policy: Policy, baseline: Array, starts: Array, keys: Array
-    ) -> tuple[Policy, Array, tuple[trpo.ImproveInfo, ImagineInfo]]:
-        def update(
-            carry: tuple[Policy, Array], given: tuple[Array, Array]
-        ) -> tuple[tuple[Policy, Array], tuple[trpo.ImproveInfo, ImagineInfo]]:
-            (policy, baseline), (starts, key) = carry, given
-            rollouts, imagined = imagine(
-                ensemble,
-                partial(gaussian.sample, policy),
-                task.reward,
-                task.terminated,
-                starts,
-                task.horizon,
-                key,
-                config.imagine.sampling,
-                AXIS,
-            )
-            a = config.advantage
-            advantages, baseline = advantage.advantages_and_baseline(
-                rollouts, baseline, a.discount, a.gae_lambda, a.ridge, AXIS
-            )
-            batch = trpo.Batch(rollouts.states, rollouts.actions, advantages, rollouts.mask)
-            # Episode by episode: every n-th step is then one of every episode, whatever their number.
-            batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), batch)
-            policy, improved = trpo.improve(policy, batch, config.trpo, AXIS)
-            return (policy, baseline), (improved, imagined)
+        ensemble: Ensemble, policy: Policy, memory: Memory, starts: Array, keys: Array
+    ) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
+        def simulate(act: Act, starts: Array, key: Array) -> tuple[Trajectories, ImagineInfo]:
+            ends, sampling = task.terminated, config.imagine.sampling
+            return imagine(ensemble, act, task.reward, ends, starts, task.horizon, key, sampling, AXIS)
 
-        (policy, baseline), infos = jax.lax.scan(update, (policy, baseline), (starts, keys))
-        return policy, baseline, infos
+        def update(
+            carry: tuple[Policy, Memory], given: tuple[Array, Array]
+        ) -> tuple[tuple[Policy, Memory], tuple[ImproveInfo, ImagineInfo]]:
+            policy, memory, infos = improver(config, simulate, *carry, *given, AXIS)
+            return (policy, memory), infos
+
+        (policy, memory), infos = jax.lax.scan(update, (policy, memory), (starts, keys))
+        return policy, memory, infos
 
     same = PartitionSpec()
     return jax.shard_map(
@@ -160,17 +155,25 @@ def _compiled_updates(
         in_specs=(same, same, same, PartitionSpec(None, AXIS), same),
         out_specs=same,
         check_vma=False,
-    )(ensemble, policy, baseline, starts, keys)
+    )(ensemble, policy, memory, starts, keys)
 
 
 def _updates(
-    task: Task, config: Config, ensemble: Ensemble, policy: Policy, baseline: Array, starts: np.ndarray, key: Array
-) -> tuple[Policy, Array, tuple[trpo.ImproveInfo, ImagineInfo]]:
+    task: Task, config: Config, ensemble: Ensemble, policy: Policy, memory: Memory, starts: np.ndarray, key: Array
+) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
     # What cannot change the compiled code (seed, budget, ...) must not cause a compilation: it is set to a constant.
-    relevant = Config(task=task.name, imagine=config.imagine, advantage=config.advantage, trpo=config.trpo)
+    relevant = Config(
+        task=task.name,
+        improver=config.improver,
+        imagine=config.imagine,
+        advantage=config.advantage,
+        trpo=config.trpo,
+        gradient=config.gradient,
+        ppo=config.ppo,
+    )
     mesh, keys = devices.mesh(starts.shape[1], AXIS), jax.random.split(key, len(starts))
-    ensemble, policy, baseline = devices.copied((ensemble, policy, baseline), mesh)
-    return _compiled_updates(task, relevant, mesh, ensemble, policy, baseline, starts, keys)
+    ensemble, policy, memory = devices.copied((ensemble, policy, memory), mesh)
+    return _compiled_updates(task, relevant, mesh, ensemble, policy, memory, starts, keys)
 
 
 @partial(jax.jit, static_argnames=("task", "mesh"))

@@ -13,9 +13,8 @@ from typing import Any, Literal, cast
 
 from metrpo.config import Config, convert
 from metrpo.errors import ConfigError
-
-Overrides = dict[str, Any]
-"""Dotted setting -> value."""
+from metrpo.systems import PAPER as SYSTEMS_PAPER
+from metrpo.systems import SYSTEMS, Overrides
 
 PAPER: dict[str, Overrides] = {
     "Swimmer": {"iterations": 100, "collect.max_train": 100_000, "collect.max_validation": 50_000},
@@ -76,17 +75,20 @@ SAME_AS = {"HopperUpright": "Hopper", "HumanoidStandup": "Humanoid"}
 """Variants share their task's row."""
 
 
-def preset(task: str, name: str = "fast", **top_level: Any) -> Config:
-    """The config of a preset for a task; `top_level` settings such as `seed=1` on top.
+def preset(task: str, name: str = "fast", system: str = "me-trpo", **top_level: Any) -> Config:
+    """The config of a preset for a task and one of the paper's systems; `top_level` settings such as `seed=1` on top.
 
-    Raises `ConfigError` for an unknown preset or setting.
+    Raises `ConfigError` for an unknown preset, system or setting.
     """
     if name not in ("fast", "paper"):
         raise ConfigError(f"preset: expected fast or paper, got {name!r}")
     row = SAME_AS.get(task, task)
     overrides = PAPER.get(row, {}) if name == "paper" else FAST_ALL | FAST.get(row, {})
+    if system not in SYSTEMS:
+        raise ConfigError(f"system: expected one of {', '.join(SYSTEMS)}, got {system!r}")
+    overrides = overrides | SYSTEMS[system] | (SYSTEMS_PAPER.get(system, {}) if name == "paper" else {})
     config = Config(task=task, preset=cast(Literal["fast", "paper"], name))
-    return override(config, overrides | top_level)
+    return override(config, overrides | {"system": system} | top_level)
 
 
 def override(config: Config, values: Overrides) -> Config:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -64,3 +65,9 @@ class Trajectories(NamedTuple):
     """[T, N]"""
     mask: Array
     """[T, N], 1 where the step counts: 0 after termination and in rollouts that diverged."""
+
+
+Act = Callable[[Array, Array], Array]
+"""(states [N, S], key) -> actions [N, A]."""
+Simulate = Callable[[Act, Array, Array], tuple[Trajectories, Any]]
+"""(act, start states [N, S], key) -> imagined episodes, and what they looked like."""

@@ -23,6 +23,7 @@ from metrpo.model.ensemble import Ensemble
 from metrpo.model.fit import fit
 from metrpo.model.imagine import imagine
 from metrpo.policy import advantage, gaussian, trpo
+from metrpo.policy.batch import Batch
 from metrpo.policy.gaussian import Policy
 from metrpo.presets import override, preset
 from metrpo.types import Array, Trajectories, Transitions
@@ -190,10 +191,10 @@ def _trpo(config: TRPOConfig) -> Work:
     noise = rng.standard_normal((count, ACTION), dtype=np.float32)
     actions = np.asarray(gaussian.mean(policy, jnp.asarray(states))) + noise
     ones = np.ones(count, np.float32)
-    batch = trpo.Batch(states, actions, rng.standard_normal(count, dtype=np.float32), ones)
+    batch = Batch(states, actions, rng.standard_normal(count, dtype=np.float32), ones)
     mesh, whole, share = devices.mesh(count, phase.AXIS), PartitionSpec(), PartitionSpec(phase.AXIS)
 
-    def update(policy: Policy, batch: trpo.Batch) -> Any:
+    def update(policy: Policy, batch: Batch) -> Any:
         return trpo.improve(policy, batch, config, phase.AXIS)
 
     run = jax.jit(

@@ -18,7 +18,7 @@ from typing import Any
 
 import jax
 
-from metrpo import algorithm
+from metrpo import algorithm, training
 from metrpo.bench import ours, peers
 from metrpo.run.directory import RunDirectory
 from metrpo.run.machine import cores, device_names
@@ -206,7 +206,7 @@ def _iterations(tell: Tell) -> Iterations:
     seconds, outside, counts = [], [], []
     with tempfile.TemporaryDirectory() as scratch, RunDirectory(Path(scratch) / "run", config) as run:
         state = algorithm.init(config)
-        while not algorithm.finished(config, state):
+        while not training.finished(config, state):
             tell(f"outer iteration {state.iteration + 1} of {config.iterations}")
             start = time.perf_counter()
             with compilations() as seen:

@@ -139,7 +139,7 @@ def _log_probability(means: Any, log_std: Any, actions: Any) -> Any:
     return -0.5 * ((actions - means) * (-log_std).exp()).square().sum(dim=1) - log_std.sum()
 
 
-def _flat_gradient(value: Any, parameters: list[Any], **options: bool) -> Any:
+def _flat_gradient(value: Any, parameters: list[Any], **options: Any) -> Any:
     return torch.cat([x.reshape(-1) for x in torch.autograd.grad(value, parameters, **options)])
 
 

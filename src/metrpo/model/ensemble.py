@@ -91,6 +91,11 @@ def predict_delta(ensemble: Ensemble, states: Array, actions: Array) -> Array:
     return n.delta_mean + n.delta_std * output
 
 
+def first_member(ensemble: Ensemble) -> Ensemble:
+    """The first model as an ensemble of one."""
+    return ensemble._replace(networks=tuple((weights[:1], biases[:1]) for weights, biases in ensemble.networks))
+
+
 def with_products(networks: Networks, dtype: str) -> Networks:
     """The networks with weights of `dtype`, in which their matrix products are then taken; sums stay float32."""
     return tuple((weights.astype(dtype), biases) for weights, biases in networks)

@@ -1,7 +1,7 @@
 """Rollouts through the ensemble: the simulator in which the policy learns (paper, section 5).
 
-Sampling functions choose the next state: (ensemble, states [N, S], actions [N, A], key) -> [N, S]. They stand in
-one table, `SAMPLINGS`.
+Sampling functions choose the next state: (ensemble, states [N, S], actions [N, A], keys) -> [N, S]. They stand in
+one table, `SAMPLINGS` (paper, appendix "Ensemble sampling methods").
 """
 
 from __future__ import annotations
@@ -13,11 +13,9 @@ import jax
 import jax.numpy as jnp
 
 from metrpo.devices import across, share_of
-from metrpo.model.ensemble import Ensemble, predict
-from metrpo.types import Array, Trajectories
+from metrpo.model.ensemble import Ensemble, first_member, predict
+from metrpo.types import Act, Array, Trajectories
 
-Act = Callable[[Array, Array], Array]
-"""(states [N, S], key) -> actions [N, A]."""
 Reward = Callable[[Array, Array, Array], Array]
 Terminated = Callable[[Array], Array]
 
@@ -51,8 +49,26 @@ def model_choice(key: Array, count: int, members: int) -> tuple[Array, Array]:
     return slots, models
 
 
-def step_rand(ensemble: Ensemble, states: Array, actions: Array, key: Array) -> Array:
+class Keys(NamedTuple):
+    """Randomness of one imagined step."""
+
+    step: Array
+    """Another one in every step."""
+    episode: Array
+    """The same in all steps of a batch of episodes."""
+
+
+def step_rand(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
     """One model drawn at random for each state and step (paper, section 5)."""
+    return _of_drawn_models(ensemble, states, actions, keys.step)
+
+
+def eps_rand(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
+    """One model drawn at random for each episode."""
+    return _of_drawn_models(ensemble, states, actions, keys.episode)
+
+
+def _of_drawn_models(ensemble: Ensemble, states: Array, actions: Array, key: Array) -> Array:
     slots, _ = model_choice(key, states.shape[0], ensemble.members)
     # The blanks repeat the last state; their predictions are dropped.
     grouped = predict(
@@ -61,7 +77,46 @@ def step_rand(ensemble: Ensemble, states: Array, actions: Array, key: Array) -> 
     return jnp.zeros_like(states).at[slots].set(grouped, mode="drop")
 
 
-SAMPLINGS: dict[str, Callable[[Ensemble, Array, Array, Array], Array]] = {"step_rand": step_rand}
+def one_model(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
+    """The first model, always."""
+    return predict(first_member(ensemble), states[None], actions[None])[0]
+
+
+def model_mean(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
+    """The mean of all models' predictions."""
+    return jnp.mean(_of_all_models(ensemble, states, actions), axis=0)
+
+
+def model_med(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
+    """The median of all models' predictions, dimension by dimension."""
+    return jnp.median(_of_all_models(ensemble, states, actions), axis=0)
+
+
+def model_mean_std(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
+    """Drawn from N(mean, std^2) of all models' predictions, dimension by dimension."""
+    predictions = _of_all_models(ensemble, states, actions)
+    noise = jax.random.normal(keys.step, states.shape)
+    # Not jnp.std: where all models agree, its gradient is NaN.
+    variance = jnp.mean(jnp.square(predictions - jnp.mean(predictions, axis=0)), axis=0)
+    std = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
+    return jnp.mean(predictions, axis=0) + std * noise
+
+
+def _of_all_models(ensemble: Ensemble, states: Array, actions: Array) -> Array:
+    def all_models(x: Array) -> Array:
+        return jnp.broadcast_to(x, (ensemble.members, *x.shape))
+
+    return predict(ensemble, all_models(states), all_models(actions))
+
+
+SAMPLINGS: dict[str, Callable[[Ensemble, Array, Array, Keys], Array]] = {
+    "step_rand": step_rand,
+    "model_mean_std": model_mean_std,
+    "model_mean": model_mean,
+    "model_med": model_med,
+    "eps_rand": eps_rand,
+    "one_model": one_model,
+}
 
 
 def imagine(
@@ -81,13 +136,15 @@ def imagine(
     device's share of the batch; the trajectories stay with it, the info is about all (see `metrpo.devices`).
     """
     next_state = SAMPLINGS[sampling]
+    key = share_of(key, axis)
+    episode_key = jax.random.fold_in(key, horizon)
 
     def step(carry: tuple[Array, Array, Array], key: Array) -> tuple[tuple[Array, Array, Array], Trajectories]:
         states, alive, diverged = carry
         action_key, model_key = jax.random.split(key)
         actions = act(states, action_key)
         clipped = jnp.clip(actions, -1.0, 1.0)
-        following = next_state(ensemble, states, clipped, model_key)
+        following = next_state(ensemble, states, clipped, Keys(model_key, episode_key))
         rewards = reward(states, clipped, following)
         bad = ~(jnp.all(jnp.abs(following) < EXPLODED, axis=-1) & jnp.isfinite(rewards))
         recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive)
@@ -99,7 +156,6 @@ def imagine(
         return (following, alive, diverged), recorded
 
     count = starts.shape[0]
-    key = share_of(key, axis)
     carry = (starts, jnp.ones(count), jnp.zeros(count, bool))
     (_, _, diverged), trajectories = jax.lax.scan(step, carry, jax.random.split(key, horizon))
     mask = trajectories.mask * (1.0 - diverged)

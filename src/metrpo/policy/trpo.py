@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,37 +12,10 @@ from jax.flatten_util import ravel_pytree
 from metrpo.config import TRPOConfig
 from metrpo.devices import across
 from metrpo.policy import gaussian
+from metrpo.policy.batch import Batch, ImproveInfo
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.linearised import Linearised, chunked, forward, gauss_newton, linearise, pull_back
 from metrpo.types import Array
-
-
-class Batch(NamedTuple):
-    """n steps to learn from."""
-
-    states: Array
-    """[n, S]"""
-    actions: Array
-    """[n, A], as drawn."""
-    advantages: Array
-    """[n], standardised."""
-    mask: Array
-    """[n], 1 where the step counts."""
-
-
-class ImproveInfo(NamedTuple):
-    """What one policy update did."""
-
-    kl: Array
-    """Mean KL(old || new); 0 when rejected."""
-    improvement: Array
-    """Gain of the surrogate objective."""
-    accepted: Array
-    """The line search found a step."""
-    backtracks: Array
-    """Tries before the accepted one."""
-    cg_residual: Array
-    """|F x - g| / |g| after the last conjugate-gradient iteration."""
 
 
 def improve(policy: Policy, batch: Batch, config: TRPOConfig, axis: str | None = None) -> tuple[Policy, ImproveInfo]:

@@ -1,7 +1,7 @@
-"""When to stop improving the policy: the paper's rule (section 5, "Policy validation").
+"""When to stop improving the policy: the paper's rule and those it compares (section 5 and "Ensemble validation").
 
-The rule is a small state machine on the host: it sees the values of every validated policy and says which policy is
-the accepted one and whether to go on. Rules stand in one table, `RULES`.
+A rule looks at some evidence of every validated policy and decides whether it takes the place of the accepted one.
+Rules stand in one table, `RULES`; the phase goes on until nothing has been accepted for a while.
 """
 
 from __future__ import annotations
@@ -15,13 +15,24 @@ from metrpo.config import ValidateConfig
 from metrpo.types import Array
 
 
-class Verdict(NamedTuple):
-    """What a validation found."""
+class Evidence(NamedTuple):
+    """What a rule may look at."""
 
-    accepted: bool
-    """This policy is the new reference."""
-    fraction_improved: float
-    """Share of the models in which it beats the reference."""
+    values: np.ndarray
+    """[K], each model's value of the policy: mean return of the deterministic policy over the full horizon."""
+    rollouts: np.ndarray
+    """[1], mean return of the stochastic rollouts of the last update; before the first update -inf."""
+    real: Callable[[], float]
+    """The policy's return in the real environment: an oracle."""
+
+
+class Rule(NamedTuple):
+    """What to look at, and when that accepts a policy."""
+
+    evidence: Callable[[Evidence], np.ndarray]
+    """[n] numbers, of every policy."""
+    decide: Callable[[Array, Array, ValidateConfig], bool]
+    """(of the policy, of the accepted one, config) -> whether the policy becomes the accepted one."""
 
 
 def fraction_improved(values: Array, reference: Array) -> float:
@@ -33,10 +44,20 @@ def fraction_improved(values: Array, reference: Array) -> float:
     return float(np.mean(np.isfinite(new) & ((new > old) | np.isnan(old))))
 
 
-def ensemble_rule(values: Array, reference: Array, config: ValidateConfig) -> Verdict:
-    """Accept while at least `threshold` of the models improve."""
-    fraction = fraction_improved(values, reference)
-    return Verdict(fraction >= config.threshold, fraction)
+def most_improve(values: Array, reference: Array, config: ValidateConfig) -> bool:
+    """At least `threshold` of the numbers improve (of a single number: it does)."""
+    return fraction_improved(values, reference) >= config.threshold
 
 
-RULES: dict[str, Callable[[Array, Array, ValidateConfig], Verdict]] = {"ensemble": ensemble_rule}
+def always(values: Array, reference: Array, config: ValidateConfig) -> bool:
+    """Every policy is accepted, so that `max_updates` alone ends the phase."""
+    return True
+
+
+RULES: dict[str, Rule] = {
+    "ensemble": Rule(lambda e: e.values, most_improve),
+    "one_model": Rule(lambda e: e.values[:1], most_improve),
+    "real": Rule(lambda e: np.array([e.real()]), most_improve),
+    "trpo_mean": Rule(lambda e: e.rollouts, most_improve),
+    "no_early": Rule(lambda e: e.values, always),
+}

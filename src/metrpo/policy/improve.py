@@ -1,0 +1,110 @@
+"""The ways to improve a policy in the ensemble, in one table: `IMPROVERS`.
+
+An improver is (config, simulate, policy, memory, starts [N, S], key, axis) -> (policy, memory, infos): one policy
+update on rollouts that `simulate` imagines from `starts`. With `axis`, `starts` are this device's share (see
+`metrpo.devices`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from metrpo.config import Config
+from metrpo.policy import advantage, bptt, gaussian, ppo, trpo, vpg
+from metrpo.policy.ascent import init_moments
+from metrpo.policy.batch import Batch, ImproveInfo
+from metrpo.policy.gaussian import Policy
+from metrpo.types import Act, Array, Simulate, Trajectories
+
+
+class Memory(NamedTuple):
+    """What an improver keeps from update to update."""
+
+    baseline: Array
+    """Weights of the linear baseline, fitted to the last batch."""
+    moments: Any
+    """Adam's; of improvers other than TRPO."""
+
+
+_SHUFFLE = 2**31 - 1
+"""Derives a key that is none of the devices' (`metrpo.devices.share_of`)."""
+Infos = tuple[ImproveInfo, Any]
+"""Of the update, and of the rollouts it learned from."""
+Improver = Callable[[Config, Simulate, Policy, Memory, Array, Array, str | None], tuple[Policy, Memory, Infos]]
+Step = Callable[[Config, Policy, Any, Batch, Array, str | None], tuple[Policy, Any, ImproveInfo]]
+"""(config, policy, moments, batch, key, axis) -> (policy, moments, info): a step of a score-function improver."""
+
+
+def init_memory(config: Config, policy: Policy, baseline: Array) -> Memory:
+    """The memory at the start of a policy phase: the baseline goes on, Adam starts afresh."""
+    return Memory(baseline, () if config.improver == "trpo" else init_moments(policy, config.gradient))
+
+
+def batch_of(config: Config, rollouts: Trajectories, baseline: Array, axis: str | None = None) -> tuple[Batch, Array]:
+    """The rollouts [T, N] as a batch of T N steps with their advantages under `baseline`; and the baseline refitted."""
+    a = config.advantage
+    advantages, baseline = advantage.advantages_and_baseline(
+        rollouts, baseline, a.discount, a.gae_lambda, a.ridge, axis
+    )
+    batch = Batch(rollouts.states, rollouts.actions, advantages, rollouts.mask)
+    # Episode by episode: every n-th step is then one of every episode, whatever their number.
+    return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), batch), baseline
+
+
+def _by_score_function(step: Step) -> Improver:
+    """Learns from stochastic rollouts and their advantages; never asks the models for a gradient."""
+
+    def update(
+        config: Config, simulate: Simulate, policy: Policy, memory: Memory, starts: Array, key: Array, axis: str | None
+    ) -> tuple[Policy, Memory, Infos]:
+        rollouts, imagined = simulate(partial(gaussian.sample, policy), starts, key)
+        batch, baseline = batch_of(config, rollouts, memory.baseline, axis)
+        policy, moments, improved = step(config, policy, memory.moments, batch, jax.random.fold_in(key, _SHUFFLE), axis)
+        return policy, Memory(baseline, moments), (improved, imagined)
+
+    return update
+
+
+def _through_models(act: Callable[[Policy], Act]) -> Improver:
+    """Follows the gradient of the imagined return itself."""
+
+    def update(
+        config: Config, simulate: Simulate, policy: Policy, memory: Memory, starts: Array, key: Array, axis: str | None
+    ) -> tuple[Policy, Memory, Infos]:
+        new, moments, infos = bptt.improve(policy, memory.moments, act, simulate, starts, config.gradient, key, axis)
+        return new, memory._replace(moments=moments), infos
+
+    return update
+
+
+def _trpo(
+    config: Config, policy: Policy, moments: Any, batch: Batch, key: Array, axis: str | None
+) -> tuple[Policy, Any, ImproveInfo]:
+    new, info = trpo.improve(policy, batch, config.trpo, axis)
+    return new, moments, info
+
+
+def _ppo(
+    config: Config, policy: Policy, moments: Any, batch: Batch, key: Array, axis: str | None
+) -> tuple[Policy, Any, ImproveInfo]:
+    return ppo.improve(policy, moments, batch, config.ppo, config.gradient, key, axis)
+
+
+def _vpg(
+    config: Config, policy: Policy, moments: Any, batch: Batch, key: Array, axis: str | None
+) -> tuple[Policy, Any, ImproveInfo]:
+    return vpg.improve(policy, moments, batch, config.gradient, axis)
+
+
+IMPROVERS: dict[str, Improver] = {
+    "trpo": _by_score_function(_trpo),
+    "ppo": _by_score_function(_ppo),
+    "vpg": _by_score_function(_vpg),
+    "bptt": _through_models(bptt.deterministic),
+    "bptt-stochastic": _through_models(bptt.stochastic),
+}

@@ -1,0 +1,89 @@
+"""Training by any method: one outer iteration after the other until the budget is spent, saved and resumed.
+
+`algorithm` is the method that this project is for; `baselines` are what it is compared with. A method is a pair of
+functions, init(config) -> state and step(config, state, progress) -> (state, row of metrics).
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metrpo.algorithm import Row
+from metrpo.config import Config
+from metrpo.run.directory import RunDirectory, Saved
+from metrpo.run.progress import SILENT, Progress
+
+METHODS = {
+    "model-based": "metrpo.algorithm",
+    "trpo": "metrpo.baselines.model_free",
+    "svg": "metrpo.baselines.svg",
+    "ppo": "metrpo.baselines.sb3",
+    "ddpg": "metrpo.baselines.sb3",
+}
+"""Modules with `init` and `step`; imported when used, for some need libraries of their own."""
+
+
+def init(config: Config) -> Saved:
+    """The state before the first iteration of the config's method."""
+    state: Saved = import_module(METHODS[config.method]).init(config)
+    return state
+
+
+def step(config: Config, state: Saved, progress: Progress = SILENT) -> tuple[Saved, Row]:
+    """One outer iteration of the config's method: the next state and its row of metrics."""
+    following: tuple[Saved, Row] = import_module(METHODS[config.method]).step(config, state, progress)
+    return following
+
+
+def train(config: Config, run_dir: str | Path | None = None, progress: Progress = SILENT) -> Saved:
+    """Runs the loop until the budget is spent and returns the last state.
+
+    With `run_dir`, every iteration is saved there; a run found there is resumed, exactly as if it had never stopped.
+
+    Raises `TaskError` for an unknown task and `RunDirectoryError` when `run_dir` cannot be used (see `RunDirectory`).
+    """
+    template = init(config)
+    if run_dir is None:
+        return _loop(config, template, progress, lambda state, row: row)
+    with RunDirectory(run_dir, config) as run:
+        return _loop(config, run.load(template) or template, progress, run.save)
+
+
+def _loop(config: Config, state: Saved, progress: Progress, save: Callable[[Saved, Row], Mapping[str, Any]]) -> Saved:
+    seconds: list[float] = []
+    try:
+        while not finished(config, state):
+            started = time.monotonic()
+            left = _iterations_left(config, state)
+            progress.begin(state.iteration + 1, None if left is None else state.iteration + left)
+            state, row = step(config, state, progress)
+            written = save(state, row)
+            # Of the last three: iterations grow with the data, and the first one compiled.
+            seconds = [*seconds, time.monotonic() - started][-3:]
+            left = _iterations_left(config, state)
+            progress.end(written, None if left is None else left * float(np.mean(seconds)))
+    finally:
+        progress.close()
+    return state
+
+
+def _iterations_left(config: Config, state: Saved) -> int | None:
+    if config.real_steps is None:
+        return config.iterations - state.iteration
+    if not state.iteration:
+        return None
+    return math.ceil((config.real_steps - state.real_steps) / (state.real_steps / state.iteration))
+
+
+def finished(config: Config, state: Saved) -> bool:
+    """Whether the budget, iterations or real steps, is spent."""
+    if config.real_steps is not None:
+        return state.real_steps >= config.real_steps
+    return state.iteration >= config.iterations
