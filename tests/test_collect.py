@@ -15,7 +15,8 @@ ZERO = lambda state: np.zeros(2)  # noqa: E731
 
 def collect(task=probe.PROBE, mean=ZERO, seed=0, **settings):
     config = CollectConfig(**{"steps": 100, "max_std": 0.2, **settings})
-    return real.collect(task, lambda rng: mean, config, np.random.default_rng(seed))
+    explorer = lambda rng: real.explore(mean, config, rng)  # noqa: E731
+    return real.collect(task, explorer, config.steps, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize(("steps", "episodes"), [(1, 1), (20, 1), (21, 2), (100, 5), (101, 6)])
@@ -88,14 +89,14 @@ def test_one_std_per_step_varies_within_the_episode():
     assert np.corrcoef(np.abs(z.T))[0, 1] > 0.2
 
 
-def test_a_mean_policy_is_drawn_for_every_episode():
+def test_an_acting_policy_is_drawn_for_every_episode():
     drawn = []
 
     def draw(rng):
         drawn.append(rng.normal())
         return lambda state: np.full(2, np.tanh(drawn[-1]))
 
-    episodes = real.collect(probe.PROBE, draw, CollectConfig(steps=60, max_std=0.0), np.random.default_rng(0))
+    episodes = real.collect(probe.PROBE, draw, 60, np.random.default_rng(0))
     assert len(drawn) == len(set(drawn)) == 3
     for e, d in zip(episodes, drawn, strict=True):
         np.testing.assert_allclose(e.actions, np.tanh(d), rtol=1e-6)
@@ -113,8 +114,7 @@ def test_the_seed_decides_everything():
 
 def test_progress_is_told_the_steps_so_far():
     told = []
-    config = CollectConfig(steps=50)
-    real.collect(probe.PROBE, lambda rng: ZERO, config, np.random.default_rng(0), told.append)
+    real.collect(probe.PROBE, lambda rng: ZERO, 50, np.random.default_rng(0), told.append)
     assert told == [20, 40, 60]
 
 

@@ -84,8 +84,9 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
     with clock("collect"):
         progress.stage("collect", config.collect.steps)
         rng = rng_of(config.seed, iteration, Stage.COLLECT)
-        actor = partial(_perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise)
-        episodes = real.collect(task, actor, config.collect, rng, progress.update)
+        mean = partial(_perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise)
+        explorer = lambda rng: real.explore(mean(rng), config.collect, rng)  # noqa: E731
+        episodes = real.collect(task, explorer, config.collect.steps, rng, progress.update)
         dataset = datasets.add(state.dataset, episodes, config.collect, rng)
     with clock("fit"):
         progress.stage("fit", None)

@@ -236,7 +236,9 @@ def _collect() -> Work:
     steps = config.steps
 
     def run() -> None:
-        real.collect(_task(), lambda rng: partial(gaussian.mean, policy), config, np.random.default_rng(0))
+        mean = partial(gaussian.mean, policy)
+        explorer = lambda rng: real.explore(mean, config, rng)  # noqa: E731
+        real.collect(_task(), explorer, config.steps, np.random.default_rng(0))
 
     return Work(_timed(run), units=steps)
 

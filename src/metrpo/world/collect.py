@@ -13,26 +13,27 @@ from metrpo.world.task import Task
 
 Act = Callable[[np.ndarray], np.ndarray]
 """State [S] -> action [A], not yet clipped."""
+OnEpisode = Callable[[int], None]
+"""Called after every episode with the steps so far."""
 
 
 def collect(
     task: Task,
-    draw_mean: Callable[[np.random.Generator], Act],
-    config: CollectConfig,
+    draw_act: Callable[[np.random.Generator], Act],
+    at_least: int,
     rng: np.random.Generator,
-    on_episode: Callable[[int], None] = lambda steps: None,
+    on_episode: OnEpisode = lambda steps: None,
 ) -> list[Episode]:
-    """Whole episodes of at least `config.steps` steps together, with the paper's exploration (appendix A.1.1).
+    """Whole episodes of `at_least` steps together; `draw_act(rng)` acts in one episode and brings its own noise.
 
-    `draw_mean(rng)` gives the mean action of an episode's policy (parameter noise is drawn there). Action noise:
-    std ~ U[0, max_std], per episode or per step, times N(0, I). `on_episode(steps so far)` follows every episode.
+    `on_episode(steps so far)` follows every episode.
     """
     episodes: list[Episode] = []
     steps = 0
     env = task.make_env()
     try:
-        while steps < config.steps:
-            episodes.append(_episode(env, _explore(draw_mean(rng), config, rng), _seed(rng)))
+        while steps < at_least:
+            episodes.append(_episode(env, draw_act(rng), _seed(rng)))
             steps += len(episodes[-1].rewards)
             on_episode(steps)
     finally:
@@ -59,7 +60,9 @@ def reset_states(task: Task, count: int, rng: np.random.Generator) -> np.ndarray
         env.close()
 
 
-def _explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
+def explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
+    """The paper's exploration (appendix A.1.1): `mean` plus std x N(0, I), std ~ U[0, max_std] per episode or step."""
+
     def stds() -> Iterator[float]:
         std = rng.uniform(0.0, config.max_std)
         while True:

@@ -39,9 +39,9 @@ def add(dataset: Dataset, episodes: list[Episode], config: CollectConfig, rng: n
     validation = [episodes[i] for i in order[:held_out]]
     train = [episodes[i] for i in order[held_out:]]
     return Dataset(
-        _append(dataset.train, train, config.max_train),
+        append(dataset.train, train, config.max_train),
         # A single first episode serves for both: there is nothing else to validate on.
-        _append(dataset.validation, validation or ([] if dataset.validation.size else train), config.max_validation),
+        append(dataset.validation, validation or ([] if dataset.validation.size else train), config.max_validation),
         np.concatenate([dataset.starts, *(e.states[:1] for e in episodes)]),
     )
 
@@ -58,7 +58,8 @@ def with_capacity(transitions: Transitions, capacity: int) -> Transitions:
     return Transitions(padded(t.states), padded(t.actions), padded(t.deltas), np.int32(t.size))
 
 
-def _append(old: Transitions, episodes: list[Episode], most: int) -> Transitions:
+def append(old: Transitions, episodes: list[Episode], most: int) -> Transitions:
+    """The transitions with those of `episodes` added; of more than `most` the oldest go."""
     states = np.concatenate([old.states, *(e.states[:-1] for e in episodes)])[-most:]
     actions = np.concatenate([old.actions, *(e.actions for e in episodes)])[-most:]
     deltas = [np.diff(e.states, axis=0) for e in episodes]

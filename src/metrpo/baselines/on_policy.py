@@ -1,0 +1,47 @@
+"""Real episodes of a stochastic policy, with the actions as it drew them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from metrpo.policy import gaussian
+from metrpo.policy.gaussian import Policy
+from metrpo.types import Episode
+from metrpo.world import collect as real
+from metrpo.world.task import Task
+
+
+class Drawn(NamedTuple):
+    """Real episodes and what the policy drew in them."""
+
+    episodes: list[Episode]
+    actions: list[np.ndarray]
+    """[L, A] of each episode, before clipping: log-probabilities are of these."""
+
+
+def collect(
+    task: Task,
+    policy: Policy,
+    at_least: int,
+    rng: np.random.Generator,
+    on_episode: real.OnEpisode = lambda steps: None,
+) -> Drawn:
+    """Whole episodes of `at_least` steps together, acting by samples of `policy` (see `world.collect.collect`)."""
+    host = jax.tree.map(np.asarray, policy)
+    std, drawn = np.exp(host.log_std), []
+
+    def draw_act(rng: np.random.Generator) -> real.Act:
+        actions: list[np.ndarray] = []
+        drawn.append(actions)
+
+        def act(state: np.ndarray) -> np.ndarray:
+            actions.append(gaussian.mean(host, state) + std * rng.standard_normal(len(std)))
+            return actions[-1]
+
+        return act
+
+    episodes = real.collect(task, draw_act, at_least, rng, on_episode)
+    return Drawn(episodes, [np.array(actions, np.float32) for actions in drawn])
