@@ -1,4 +1,4 @@
-"""The command line: `metrpo train | evaluate | render | tasks | doctor | bench`.
+"""The command line: `metrpo train | evaluate | render | tasks | doctor | bench | reproduce`.
 
 Whatever imports JAX or MuJoCo is imported where it is used: help must come at once, and JAX reads its environment
 variables when imported.
@@ -18,7 +18,7 @@ from typing import Any
 
 from metrpo.config import Config
 from metrpo.errors import MetrpoError
-from metrpo.options import Bench, Doctor, Evaluate, Render, Tasks, Train, parse
+from metrpo.options import Bench, Doctor, Evaluate, Render, Reproduce, Tasks, Train, parse
 
 
 class _Terminated(BaseException):
@@ -60,7 +60,7 @@ def _train(command: Train) -> int:
     try:
         train(config, run_dir, progress)
         progress.close()
-        _report(run_dir)
+        _report(run_dir, command.video)
     except (KeyboardInterrupt, _Terminated):
         progress.close()
         print(f"metrpo: stopped; {run_dir} keeps every finished iteration. The same command goes on.", file=sys.stderr)
@@ -70,7 +70,7 @@ def _train(command: Train) -> int:
     return 0
 
 
-def _report(run_dir: Path) -> None:
+def _report(run_dir: Path, video: bool) -> None:
     """Says what the run has earned and where its files lie; a machine that cannot make a video costs the video only."""
     from metrpo.evaluation import render
     from metrpo.run.metrics import read_metrics
@@ -81,6 +81,8 @@ def _report(run_dir: Path) -> None:
     files = {"curve": "curve.png", "metrics": "metrics.csv", "policy": "policy.npz"}
     for what, name in files.items():
         print(f"  {what:<8} {run_dir / name}", flush=True)
+    if not video:
+        return
     print(f"  {'video':<8} ", end="", flush=True)  # it takes a while
     try:
         print(render(run_dir))
@@ -143,6 +145,34 @@ def _bench(command: Bench) -> int:
     return 0
 
 
+def _reproduce(command: Reproduce) -> int:
+    from metrpo.experiments.figures import FIGURES, runs_of
+    from metrpo.experiments.publish import publish
+    from metrpo.experiments.reproduce import reproduce
+    from metrpo.run.machine import cores
+
+    def tell(text: str) -> None:
+        print(text, file=sys.stderr if command.json else sys.stdout, flush=True)
+
+    runs = runs_of(command.figure, command.scale, command.tasks, command.seeds)
+    out = command.out or Path("runs") / f"reproduce-{command.scale}"
+    names = list(FIGURES) if command.figure == "all" else [command.figure]
+    signal.signal(signal.SIGTERM, _terminate)
+    failed = []
+    try:
+        if command.run:
+            failed = reproduce(runs, out, command.jobs or cores(), tell)
+    except (KeyboardInterrupt, _Terminated):
+        print(f"metrpo: stopped; {out} keeps every finished iteration. The same command goes on.", file=sys.stderr)
+        raise
+    numbers = publish(names, runs, out, tell)
+    if command.json:
+        print(json.dumps(numbers))
+    if failed:
+        print(f"metrpo: {len(failed)} of {len(runs)} runs failed; the same command tries again", file=sys.stderr)
+    return 1 if failed else 0
+
+
 def _version() -> int:
     from metrpo.run.files import metrpo_version
 
@@ -161,4 +191,5 @@ _COMMANDS: dict[type, Callable[[Any], int]] = {
     Tasks: _tasks,
     Doctor: _doctor,
     Bench: _bench,
+    Reproduce: _reproduce,
 }

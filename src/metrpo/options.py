@@ -42,6 +42,8 @@ class Train(Config):
     """Where the run lives; default: runs/<task>-[<system>-]<preset>-seed<seed>."""
     device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="{cpu,gpu}")] = None
     """Where JAX computes; default: a GPU if JAX can use one."""
+    video: bool = True
+    """Record the final policy when all is done."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,42 @@ class Bench:
             raise ConfigError(f"rounds: expected at least 1, got {self.rounds}")
 
 
-Command = Train | Evaluate | Render | Tasks | Doctor | Bench
+@dataclass(frozen=True)
+class Reproduce:
+    """Run what a figure of the paper compares, and draw it: every run an ordinary `metrpo train`.
+
+    FIGURE is comparison, optimizers, ensemble-size, overfitting, sampling, validation, wall-clock, or all. Finished
+    runs are kept, stopped ones go on, and the figure shows what there is. For example:
+        metrpo reproduce all --scale smoke
+        metrpo reproduce optimizers --scale laptop --tasks Swimmer --seeds 3 --jobs 2
+        metrpo reproduce all --scale laptop --no-run      # draws only
+    """
+
+    figure: Annotated[Positional[str], arg(metavar="FIGURE")]
+    """Which figure, or all."""
+    scale: Literal["smoke", "laptop", "paper"] = "laptop"
+    """smoke: minutes, learns nothing; laptop: hours on two cores; paper: as in the paper, weeks on two cores."""
+    tasks: tuple[str, ...] = ()
+    """Only these of the figure's tasks; default: the scale's."""
+    seeds: Annotated[int | None, arg(metavar="INT")] = None
+    """Seeds 0, 1, ... of each system; default: the scale's."""
+    jobs: Annotated[int | None, arg(metavar="INT")] = None
+    """Runs at a time, on cores of their own; default: one for each core."""
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder of the runs and of figures/; default: runs/reproduce-<scale>."""
+    run: bool = True
+    """Run what is missing."""
+    json: bool = False
+    """Print the figures' numbers as JSON."""
+
+    def __post_init__(self) -> None:
+        for name in ("seeds", "jobs"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ConfigError(f"{name}: expected at least 1, got {value}")
+
+
+Command = Train | Evaluate | Render | Tasks | Doctor | Bench | Reproduce
 
 _DESCRIPTION = """Model-Ensemble Trust-Region Policy Optimization: control learnt from few real steps.
 
@@ -175,6 +212,7 @@ def _with_defaults(train: Train, arguments: list[str], quiet: bool = False) -> C
         | Annotated[Tasks, subcommand("tasks")]
         | Annotated[Doctor, subcommand("doctor")]
         | Annotated[Bench, subcommand("bench")]
+        | Annotated[Reproduce, subcommand("reproduce")]
     )
     return tyro.cli(
         commands,

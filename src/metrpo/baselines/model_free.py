@@ -43,8 +43,7 @@ def init(config: Config) -> State:
     task, p = get_task(config.task), config.policy
     key = key_of(config.seed, 0, Stage.INIT)
     policy = gaussian.init(key, task.state_size, task.action_size, p.hidden, p.initial_std)
-    # On the host, as every later state: JAX would compile the update for each of the two.
-    return State(0, 0, *jax.device_get((policy, advantage.init_baseline(task.state_size))))
+    return State(0, 0, policy, advantage.init_baseline(task.state_size))
 
 
 def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
@@ -56,9 +55,10 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
         drawn = on_policy.collect(task, state.policy, config.collect.steps, rng, progress.update)
     with clock("improve"):
         progress.stage("improve")
-        policy, baseline, info = jax.device_get(
-            _update(config, state.policy, state.baseline, trajectories(drawn, task.horizon))
-        )
+        # Other settings, the seed say, must not cause a compilation.
+        relevant = Config(task=task.name, advantage=config.advantage, trpo=config.trpo)
+        batch = trajectories(drawn, task.horizon)
+        policy, baseline, info = jax.device_get(_update(relevant, state.policy, state.baseline, batch))
     with clock("evaluate"):
         progress.stage("evaluate", config.evaluation_episodes)
         returns = evaluate(config, task, policy, iteration)

@@ -256,7 +256,7 @@ def _train_policy(
     else:
         gradient = value_gradient(task, ensemble, policy, path, discount)
     policy, moments, made = ascend(policy, moments, gradient, config.gradient)
-    return (policy, moments, value, value_moments), optax.global_norm(gradient), made
+    return (policy, moments, value, value_moments), optax.tree.norm(gradient), made
 
 
 def _train_value(config: Config, normaliser: Normaliser, value: Policy, moments: Any, path: Path) -> tuple[Policy, Any]:

@@ -25,7 +25,7 @@ def ascend(policy: Policy, moments: Any, gradient: Policy, config: GradientConfi
     """One step uphill: (policy, moments, whether it was made); a gradient that is not finite moves nothing."""
     downhill = jax.tree.map(jnp.negative, gradient)
     change, next_moments = _optimizer(config).update(downhill, moments, policy)
-    finite = jnp.isfinite(optax.global_norm(gradient))
+    finite = jnp.isfinite(optax.tree.norm(gradient))
 
     def kept(new: Any, old: Any) -> Any:
         return jnp.where(finite, new, old)

@@ -29,7 +29,7 @@ def init(key: Array, state_size: int, action_size: int, hidden: tuple[int, ...],
         (xavier(k, (fan_in, fan_out)), jnp.zeros(fan_out))
         for k, fan_in, fan_out in zip(keys, sizes[:-1], sizes[1:], strict=True)
     )
-    return Policy(layers, jnp.full(action_size, math.log(initial_std)))
+    return Policy(layers, jnp.full(action_size, math.log(initial_std), jnp.float32))
 
 
 def mean(policy: Policy, states: Array) -> Array:
@@ -63,4 +63,4 @@ def kl(old_means: Array, old_log_std: Array, means: Array, log_std: Array, axis:
 
 def reset_std(policy: Policy, initial_std: float) -> Policy:
     """The policy with its standard deviation set back, as at the start of every policy phase."""
-    return policy._replace(log_std=jnp.full(policy.log_std.shape, math.log(initial_std)))
+    return policy._replace(log_std=jnp.full(policy.log_std.shape, math.log(initial_std), jnp.float32))

@@ -1,0 +1,168 @@
+"""What a figure's runs say in numbers: returns over seeds with their intervals, and how the systems compare."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from metrpo.experiments.figures import FIGURES, Run
+from metrpo.experiments.reproduce import rows_of
+from metrpo.experiments.statistics import (
+    at_steps,
+    iqm,
+    probability_of_improvement,
+    steps_to_reach,
+    stratified_bootstrap,
+)
+from metrpo.run.metrics import Row
+
+GRID = 60
+"""Points of a mean curve."""
+
+
+class Curves(NamedTuple):
+    """One system on one task: all seeds that have run."""
+
+    task: str
+    label: str
+    runs: list[Run]
+    rows: list[list[Row]]
+    """Of every seed."""
+
+    def column(self, name: str) -> list[tuple[np.ndarray, np.ndarray]]:
+        """(real steps, values) of every seed."""
+        return [(_values(rows, "real_steps"), _values(rows, name)) for rows in self.rows]
+
+
+def curves_of(figure: str, runs: Sequence[Run], out: Path) -> list[Curves]:
+    """What has been measured for a figure, by task and in the order of its legend; systems not begun are absent."""
+    found = []
+    for task in FIGURES[figure].tasks:
+        for label, system in FIGURES[figure].systems.items():
+            begun = [r for r in runs if (r.task, r.system) == (task, system) and rows_of(r, out)]
+            if begun:
+                found.append(Curves(task, label, begun, [rows_of(r, out) for r in begun]))
+    return found
+
+
+def mean_curve(curves: Curves, column: str, log: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Real steps [G], mean over seeds [G], and its 95 % bootstrap interval [G], [G] (of two seeds: their range).
+
+    Where all seeds have been measured; the steps are equal parts of the range, of its logarithm with `log`.
+    """
+    seeds = curves.column(column)
+    first, last = max(steps[0] for steps, _ in seeds), min(steps[-1] for steps, _ in seeds)
+    grid = np.geomspace(first, last, GRID) if log else np.linspace(first, last, GRID)
+    values = at_steps(seeds, grid)
+    low, high = stratified_bootstrap(lambda scores: np.mean(scores[0], axis=0), [values], repetitions=500)
+    return grid, values.mean(axis=0), low, high
+
+
+def summarise(figure: str, runs: Sequence[Run], out: Path) -> list[dict[str, Any]]:
+    """One record for each task and system of a figure; returns are real ones.
+
+    `last`, `best`: of every seed. `common_steps`: real steps that every seed of every system of this task has reached.
+    `at_common`: the return there, `average`: the mean return up to there (how soon it learns), both of every seed and
+    with the interquartile mean and its 95 % interval. `first_better`: the probability that a seed of the figure's first
+    system has the higher return (average) there. `steps`: real steps to the first system's mean last return, mean over
+    the seeds (NaN when one never reaches it); `ratio`: how many times the first system's own.
+    """
+    records = []
+    everything = curves_of(figure, runs, out)
+    for task in FIGURES[figure].tasks:
+        here = [c for c in everything if c.task == task]
+        records += [_record(c, here, next(iter(FIGURES[figure].systems))) for c in here]
+    return records
+
+
+def _record(curves: Curves, here: list[Curves], first_label: str) -> dict[str, Any]:
+    returns = curves.column("return_real")
+    common = min(steps[-1] for c in here for steps, _ in c.column("return_real"))
+    at, average = _at(curves, common), _average(curves, common)
+    record = {
+        "task": curves.task,
+        "system": curves.label,
+        "seeds": len(curves.runs),
+        "real_steps": int(min(steps[-1] for steps, _ in returns)),
+        "last": [float(r[-1]) for _, r in returns],
+        "best": [float(np.nanmax(r)) for _, r in returns],
+        "common_steps": int(common),
+        "at_common": at.tolist(),
+        "at_common_iqm": _iqm(at),
+        "average": average.tolist(),
+        "average_iqm": _iqm(average),
+        "minutes": [float(rows[-1].get("wall_seconds") or np.nan) / 60 for rows in curves.rows],
+    }
+    first = next((c for c in here if c.label == first_label), None)
+    if first is not None:
+        level = float(np.mean([r[-1] for _, r in first.column("return_real")]))
+        steps = _steps_to(curves, level)
+        record["first_better"] = [
+            float(probability_of_improvement(_at(first, common), at)),
+            float(probability_of_improvement(_average(first, common), average)),
+        ]
+        record |= {"steps": steps, "ratio": steps / _steps_to(first, level)}
+    return record
+
+
+def as_markdown(records: Sequence[dict[str, Any]]) -> str:
+    """The records as a Markdown table."""
+    heads = (
+        "task",
+        "system",
+        "real steps",
+        "last return",
+        "at common steps",
+        "average up to there",
+        "P(first better) at, average",
+        "steps to the first's last return",
+    )
+    rows = [heads, tuple("---" for _ in heads), *(_cells(r) for r in records)]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
+
+
+def _cells(r: dict[str, Any]) -> tuple[str, ...]:
+    steps = r.get("steps", np.nan)
+    reached = f"{steps:,.0f} ({r.get('ratio', np.nan):.2g}x)" if np.isfinite(steps) else "not reached"
+    return (
+        r["task"],
+        r["system"],
+        f"{r['real_steps']:,}",
+        f"{np.mean(r['last']):.1f} ({', '.join(f'{x:.1f}' for x in r['last'])})",
+        f"{_interval(r['at_common_iqm'])} at {r['common_steps']:,}",
+        _interval(r["average_iqm"]),
+        ", ".join(f"{p:.2f}" for p in r.get("first_better", [])),
+        reached,
+    )
+
+
+def _interval(iqm_low_high: Sequence[float]) -> str:
+    return "{:.1f} [{:.1f}, {:.1f}]".format(*iqm_low_high)
+
+
+def _iqm(scores: np.ndarray) -> list[float]:
+    """Interquartile mean and its 95 % interval; with fewer than three seeds the range of what resampling gives."""
+    return [float(x) for x in (iqm(scores), *stratified_bootstrap(iqm, scores))]
+
+
+def _average(curves: Curves, common: float) -> np.ndarray:
+    """Mean return between a seed's first measurement and the common steps, for every seed."""
+    seeds = curves.column("return_real")
+    return np.array([at_steps([seed], np.linspace(seed[0][0], max(common, seed[0][0]), GRID)).mean() for seed in seeds])
+
+
+def _at(curves: Curves, steps: float) -> np.ndarray:
+    return at_steps(curves.column("return_real"), np.array([steps]))[:, 0]
+
+
+def _steps_to(curves: Curves, level: float) -> float:
+    """Mean over the seeds; NaN when one of them never reaches it."""
+    return float(np.mean([steps_to_reach(steps, returns, level) for steps, returns in curves.column("return_real")]))
+
+
+def _values(rows: Sequence[Row], name: str) -> np.ndarray:
+    values = [row.get(name) for row in rows]
+    return np.array([np.nan if v is None else v for v in values], dtype=float)
