@@ -9,7 +9,7 @@ from typing import Any
 
 from metrpo.experiments.draw import draw
 from metrpo.experiments.figures import FIGURES, Run
-from metrpo.experiments.reproduce import differences, is_finished, rows_of
+from metrpo.experiments.reproduce import differences, is_finished, rows_of, with_other_seeds
 from metrpo.experiments.summary import as_markdown, summarise
 from metrpo.run.files import atomic_write
 
@@ -19,10 +19,13 @@ def publish(
 ) -> dict[str, list[dict[str, Any]]]:
     """Draws the named figures into `out`/figures, writes their numbers beside them and returns these.
 
+    Shows all seeds that have been run, also beyond those of `runs`.
+
     Tells what is unfinished and which runs were made with other settings than today's. Raises `RunDirectoryError` when
     a file cannot be written.
     """
     numbers: dict[str, list[dict[str, Any]]] = {}
+    runs = with_other_seeds(list(runs), out)
     for run in runs:
         _tell_about(run, out, tell)
     for name in names:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import subprocess
 import sys
@@ -58,6 +59,18 @@ def differences(run: Run, out: Path) -> dict[str, tuple[object, object]]:
     return difference(from_json(path.read_text()), run.config)
 
 
+def with_other_seeds(runs: list[Run], out: Path) -> list[Run]:
+    """The runs and those of the same tasks and systems that have been made with other seeds."""
+    found = {run.name: run for run in runs}
+    for run in runs:
+        for directory in sorted((out / run.name).parent.glob("seed-*")):
+            number = directory.name.removeprefix("seed-")
+            if number.isdecimal():
+                other = dataclasses.replace(run, seed=int(number))
+                found.setdefault(other.name, other)
+    return list(found.values())
+
+
 def reproduce(runs: list[Run], out: Path, jobs: int, tell: Tell) -> list[Run]:
     """Runs all that is not finished, `jobs` at a time on cores of their own, and returns those that failed.
 
@@ -102,14 +115,17 @@ def _start(run: Run, out: Path, cores: tuple[int, ...]) -> _Child:
         log = os.open(out / f"{run.name}.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     except OSError as error:
         raise MetrpoError(f"cannot write {directory}: {error.strerror or error}; choose another --out") from error
-    command = [sys.executable, "-m", "metrpo", "train", *run.arguments, "--run-dir", str(directory), "--no-video"]
-    # A group of its own: Ctrl-C is for this process, which then ends its children one by one.
-    process = subprocess.Popen(command, stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
+    # A session of its own: Ctrl-C is for this process, which then ends its children one by one.
+    process = subprocess.Popen(_command(run, directory), stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
     os.close(log)  # the process has its own
     if cores:
         with contextlib.suppress(OSError):  # it may have ended already
             os.sched_setaffinity(process.pid, cores)
     return _Child(run, process, cores, time.monotonic())
+
+
+def _command(run: Run, directory: Path) -> list[str]:
+    return [sys.executable, "-m", "metrpo", "train", *run.arguments, "--run-dir", str(directory), "--no-video"]
 
 
 def _finish(child: _Child, out: Path, count: str, tell: Tell) -> bool:

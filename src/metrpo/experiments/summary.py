@@ -67,8 +67,9 @@ def summarise(figure: str, runs: Sequence[Run], out: Path) -> list[dict[str, Any
     `last`, `best`: of every seed. `common_steps`: real steps that every seed of every system of this task has reached.
     `at_common`: the return there, `average`: the mean return up to there (how soon it learns), both of every seed and
     with the interquartile mean and its 95 % interval. `first_better`: the probability that a seed of the figure's first
-    system has the higher return (average) there. `steps`: real steps to the first system's mean last return, mean over
-    the seeds (NaN when one never reaches it); `ratio`: how many times the first system's own.
+    system has the higher return (average) there. `level`: 95 % of the way from the first system's first measurement to
+    its last, means over its seeds; `steps`: real steps to that level, mean over the seeds (NaN when one never reaches
+    it); `ratio`: how many times the first system's own.
     """
     records = []
     everything = curves_of(figure, runs, out)
@@ -98,13 +99,13 @@ def _record(curves: Curves, here: list[Curves], first_label: str) -> dict[str, A
     }
     first = next((c for c in here if c.label == first_label), None)
     if first is not None:
-        level = float(np.mean([r[-1] for _, r in first.column("return_real")]))
+        level = _level(first)
         steps = _steps_to(curves, level)
         record["first_better"] = [
             float(probability_of_improvement(_at(first, common), at)),
             float(probability_of_improvement(_average(first, common), average)),
         ]
-        record |= {"steps": steps, "ratio": steps / _steps_to(first, level)}
+        record |= {"level": level, "steps": steps, "ratio": steps / _steps_to(first, level)}
     return record
 
 
@@ -118,7 +119,7 @@ def as_markdown(records: Sequence[dict[str, Any]]) -> str:
         "at common steps",
         "average up to there",
         "P(first better) at, average",
-        "steps to the first's last return",
+        "steps to 95 % of the first's gain",
     )
     rows = [heads, tuple("---" for _ in heads), *(_cells(r) for r in records)]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
@@ -152,6 +153,11 @@ def _average(curves: Curves, common: float) -> np.ndarray:
     """Mean return between a seed's first measurement and the common steps, for every seed."""
     seeds = curves.column("return_real")
     return np.array([at_steps([seed], np.linspace(seed[0][0], max(common, seed[0][0]), GRID)).mean() for seed in seeds])
+
+
+def _level(curves: Curves) -> float:
+    start, end = (np.mean([returns[i] for _, returns in curves.column("return_real")]) for i in (0, -1))
+    return float(start + 0.95 * (end - start))
 
 
 def _at(curves: Curves, steps: float) -> np.ndarray:

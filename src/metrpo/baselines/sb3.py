@@ -1,0 +1,263 @@
+"""PPO (Schulman et al. 2017) and DDPG (Lillicrap et al. 2016) of Stable-Baselines3 in the real environment.
+
+Every iteration builds Stable-Baselines3's objects anew from the state and the iteration's seed and starts with a fresh
+episode, so that a resumed run is the same run. Observations are not normalised: the exported policy takes raw states.
+Needs the extra `baselines`; importing this without it raises `MetrpoError`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, closing
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium.spaces import Box
+from gymnasium.wrappers import TransformObservation
+
+from metrpo.algorithm import Row, evaluate
+from metrpo.config import Config
+from metrpo.errors import MetrpoError
+from metrpo.policy.gaussian import Policy
+from metrpo.run.clock import Clock
+from metrpo.run.progress import SILENT, Progress
+from metrpo.seeds import Stage, rng_of
+from metrpo.world.task import get_task
+
+try:
+    import torch
+    from stable_baselines3 import DDPG, PPO
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.logger import Logger
+    from stable_baselines3.common.monitor import Monitor
+    from stable_baselines3.common.noise import NormalActionNoise
+    from stable_baselines3.common.utils import update_learning_rate
+except ImportError as error:
+    raise MetrpoError(
+        f"the systems ppo and ddpg need PyTorch and Stable-Baselines3 ({error}): run `make baselines`, or "
+        "`pip install torch==2.13.0` and then `pip install 'metrpo[baselines]'`"
+    ) from error
+
+PPO_STEPS = 2048
+"""Real steps per update; this and `PPO_SETTINGS`: OpenAI baselines, ppo2's defaults for MuJoCo (but for the decay of
+the learning rate and the clipping of values), which are Stable-Baselines3's defaults."""
+PPO_SETTINGS: dict[str, Any] = {
+    **{"learning_rate": 3e-4, "batch_size": 64, "n_epochs": 10, "clip_range": 0.2, "max_grad_norm": 0.5},
+    **{"gamma": 0.99, "gae_lambda": 0.95, "vf_coef": 0.5, "ent_coef": 0.0},
+}
+DDPG_SETTINGS: dict[str, Any] = {"gamma": 0.99, "tau": 0.01, "batch_size": 64, "gradient_steps": 50}
+"""This and all below but `DDPG_WARM_UP`: OpenAI baselines, ddpg's defaults where Stable-Baselines3 has the setting."""
+DDPG_BUFFER, DDPG_STEPS = 1_000_000, 100
+"""Most transitions kept (the oldest go first), and real steps between two rounds of `gradient_steps`."""
+DDPG_CRITIC, DDPG_RATES = (64, 64), (1e-4, 1e-3)
+"""Sizes of the critic's hidden layers, and Adam's step sizes for the actor and the critic."""
+DDPG_NOISE = 0.2
+"""Standard deviation of the actions' Gaussian noise (there, of parameter noise adapted to have that effect)."""
+DDPG_WARM_UP = 1000
+"""Uniform actions before the first update (TD3's, Fujimoto et al. 2018); half an iteration at most."""
+
+
+class State(NamedTuple):
+    """Everything that an iteration hands to the next: a pytree of NumPy arrays whose structure the config fixes."""
+
+    iteration: int
+    """Outer iterations finished."""
+    real_steps: int
+    """Real steps collected so far."""
+    policy: Policy
+    """The actor: both give the same deterministic actions."""
+    parameters: dict[str, np.ndarray]
+    """Of all networks, by PyTorch's names."""
+    adam: tuple[tuple[tuple[np.ndarray, ...], ...], ...]
+    """Of every optimiser, of every parameter: the entries `_ADAM` of its memory."""
+    replay: dict[str, np.ndarray]
+    """DDPG's n transitions, the oldest first: `_REPLAY`, float32, [n, S] twice, [n, A], [n] twice. Empty for PPO."""
+
+
+def init(config: Config) -> State:
+    """The state before the first iteration.
+
+    Raises `TaskError` for an unknown task.
+    """
+    with closing(_environment(config)) as env:
+        return _state(config, _model(config, env, _seed(config, 0, Stage.INIT), None), 0)
+
+
+def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
+    """One outer iteration: learning for `collect.steps` real steps, rounded up to whole updates of the algorithm."""
+    iteration, clock = state.iteration + 1, Clock()
+    with closing(_environment(config)) as env, clock("improve"):
+        progress.stage("learn", config.collect.steps)
+        model = _model(config, env, _seed(config, iteration, Stage.COLLECT), state)
+        watch = _Watch(state.real_steps, clock, progress)
+        model.learn(config.collect.steps, watch, log_interval=None, reset_num_timesteps=False)
+        collected = env.get_episode_rewards()
+        state = _state(config, model, iteration)
+    with clock("evaluate"):
+        progress.stage("evaluate", config.evaluation_episodes)
+        returns = evaluate(config, get_task(config.task), state.policy, iteration)
+    return state, {
+        "iteration": state.iteration,
+        "real_steps": state.real_steps,
+        "return_real": float(np.mean(returns)),
+        "return_real_std": float(np.std(returns)),
+        "return_collected": float(np.mean(collected)) if collected else math.nan,
+        "mean_std": float(np.mean(np.exp(state.policy.log_std))),
+        **clock.row(),
+    }
+
+
+class _Watch(BaseCallback):
+    """Counts rollouts as the stage "collect", and tells the progress after each."""
+
+    def __init__(self, steps_before: int, clock: Clock, progress: Progress) -> None:
+        super().__init__()
+        self._steps_before, self._clock, self._progress = steps_before, clock, progress
+        self._collecting = ExitStack()
+
+    def _on_rollout_start(self) -> None:
+        self._collecting.enter_context(self._clock("collect"))
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self._collecting.close()
+        self._progress.update(self.num_timesteps - self._steps_before)
+
+
+def _environment(config: Config) -> Monitor:
+    # float32 halves the replay buffer, and is what the networks compute in.
+    task = get_task(config.task)
+    space = Box(-np.inf, np.inf, (task.state_size,), np.float32)
+    return Monitor(TransformObservation(task.make_env(), lambda state: state.astype(np.float32), space))
+
+
+def _seed(config: Config, iteration: int, stage: Stage) -> int:
+    return int(rng_of(config.seed, iteration, stage).integers(2**31))
+
+
+# ---------------------------------------------------------------- the two algorithms
+
+
+def _ppo(config: Config, env: Monitor, seed: int, _: State | None) -> PPO:
+    hidden, batch = list(config.policy.hidden), PPO_SETTINGS["batch_size"]
+    networks: dict[str, Any] = {"net_arch": {"pi": hidden, "vf": hidden}, "activation_fn": torch.nn.Tanh}
+    networks["log_std_init"] = math.log(config.policy.initial_std)
+    steps = min(PPO_STEPS, batch * math.ceil(config.collect.steps / batch))
+    return PPO("MlpPolicy", env, n_steps=steps, policy_kwargs=networks, seed=seed, device="cpu", **PPO_SETTINGS)
+
+
+def _ppo_policy(model: Any) -> Policy:
+    mean = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
+    return Policy(_layers(mean), _numpy(model.policy.log_std))
+
+
+class _DDPG(DDPG):
+    def _update_learning_rate(self, optimizers: Any) -> None:
+        # Called before every round of updates; Stable-Baselines3 would give both networks one rate.
+        for optimizer, rate in zip(optimizers, DDPG_RATES, strict=True):
+            update_learning_rate(optimizer, rate)
+
+
+def _ddpg(config: Config, env: Monitor, seed: int, state: State | None) -> _DDPG:
+    steps, kept = config.collect.steps, len(state.replay["rewards"]) if state else 0
+    action = np.zeros(get_task(config.task).action_size)
+    nets = {"net_arch": {"pi": list(config.policy.hidden), "qf": list(DDPG_CRITIC)}, "activation_fn": torch.nn.Tanh}
+    return _DDPG(
+        "MlpPolicy",
+        env,
+        # Room for this iteration, rounded up: the next one has a buffer of its own.
+        buffer_size=min(DDPG_BUFFER, kept + steps + DDPG_STEPS),
+        learning_starts=min(DDPG_WARM_UP, steps // 2),
+        train_freq=min(DDPG_STEPS, steps),
+        action_noise=NormalActionNoise(action, action + DDPG_NOISE),
+        policy_kwargs=nets,
+        seed=seed,
+        device="cpu",
+        **DDPG_SETTINGS,
+    )
+
+
+def _ddpg_policy(model: Any) -> Policy:
+    # The actor's output goes through tanh, as only hidden layers do in a policy: an identity after it makes it one.
+    layers = _layers(model.actor.mu)
+    identity = np.eye(len(layers[-1][1]), dtype=np.float32)
+    return Policy((*layers, (identity, 0 * identity[0])), np.full(len(identity), math.log(DDPG_NOISE), np.float32))
+
+
+def _layers(modules: Iterable[Any]) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    return tuple((_numpy(m.weight.T), _numpy(m.bias)) for m in modules if isinstance(m, torch.nn.Linear))
+
+
+_Table = dict[str, tuple[Callable[..., Any], Callable[[Any], Policy]]]
+_METHODS: _Table = {"ppo": (_ppo, _ppo_policy), "ddpg": (_ddpg, _ddpg_policy)}
+"""(config, environment, seed, state) -> algorithm, and algorithm -> policy."""
+
+
+# ---------------------------------------------------------------- state -> Stable-Baselines3 -> state
+
+_ADAM = ("step", "exp_avg", "exp_avg_sq")
+"""What PyTorch's Adam keeps of a parameter."""
+_REPLAY = ("observations", "next_observations", "actions", "rewards", "dones")
+"""The arrays of the replay buffer; the last is 1 where the task, not the clock, ended the episode."""
+
+
+def _model(config: Config, env: Monitor, seed: int, state: State | None) -> Any:
+    """The algorithm as `state` left it (None: fresh); all its randomness and the environment's come from `seed`."""
+    torch.set_num_threads(1)
+    model = _METHODS[config.method][0](config, env, seed, state)
+    model.set_logger(Logger(None, []))
+    if state is None:
+        return model
+    model.num_timesteps = state.real_steps
+    model.policy.load_state_dict({name: torch.from_numpy(value) for name, value in state.parameters.items()})
+    for optimiser, memories in zip(_optimisers(model), state.adam, strict=True):
+        for parameter, memory in zip(optimiser.param_groups[0]["params"], memories, strict=True):
+            optimiser.state[parameter] = dict(zip(_ADAM, map(torch.tensor, memory), strict=True))
+    if state.replay:
+        _put_replay(model.replay_buffer, state.replay)
+    return model
+
+
+def _state(config: Config, model: Any, iteration: int) -> State:
+    return State(
+        iteration=iteration,
+        real_steps=model.num_timesteps,
+        policy=_METHODS[config.method][1](model),
+        parameters={name: _numpy(value) for name, value in model.policy.state_dict().items()},
+        adam=tuple(_memories(optimiser) for optimiser in _optimisers(model)),
+        replay=_get_replay(model.replay_buffer) if config.method == "ddpg" else {},
+    )
+
+
+def _optimisers(model: Any) -> list[Any]:
+    return [module.optimizer for module in model.policy.modules() if getattr(module, "optimizer", None)]
+
+
+def _memories(optimiser: Any) -> tuple[tuple[np.ndarray, ...], ...]:
+    def memory(parameter: Any) -> tuple[np.ndarray, ...]:
+        # Adam makes it, of zeros, at the first update; the state's structure must be there before.
+        fresh = {name: torch.zeros(() if name == "step" else parameter.shape) for name in _ADAM}
+        return tuple(_numpy(optimiser.state.get(parameter, fresh)[name]) for name in _ADAM)
+
+    return tuple(memory(parameter) for parameter in optimiser.param_groups[0]["params"])
+
+
+def _put_replay(buffer: Any, replay: dict[str, np.ndarray]) -> None:
+    size = len(replay["rewards"])
+    for name in _REPLAY:
+        getattr(buffer, name)[:size, 0] = replay[name]
+    buffer.pos, buffer.full = size % buffer.buffer_size, size == buffer.buffer_size
+
+
+def _get_replay(buffer: Any) -> dict[str, np.ndarray]:
+    # As Stable-Baselines3 does when it samples: an end by the clock is no end.
+    buffer.dones *= 1 - buffer.timeouts
+    oldest = buffer.pos if buffer.full else 0
+    return {name: np.roll(getattr(buffer, name)[: buffer.size(), 0], -oldest, axis=0) for name in _REPLAY}
+
+
+def _numpy(tensor: Any) -> np.ndarray:
+    return np.array(tensor.detach().numpy(), order="C")

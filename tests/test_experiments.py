@@ -1,0 +1,315 @@
+"""The paper's figures: the tables of runs, what runs them, their numbers and pictures."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from metrpo import options
+from metrpo.config import Config, to_json
+from metrpo.errors import ConfigError
+from metrpo.experiments import reproduce as running
+from metrpo.experiments.draw import draw
+from metrpo.experiments.figures import FIGURES, PAPER_SECONDS, SCALES, Run, runs_of
+from metrpo.experiments.publish import publish
+from metrpo.experiments.summary import curves_of, mean_curve, summarise
+from metrpo.presets import preset
+from metrpo.run import machine
+from metrpo.run.metrics import read_metrics, to_csv
+from metrpo.systems import SYSTEMS
+from metrpo.world.task import tasks
+
+RUN = Run("Swimmer", "k-1", 0, (("iterations", 3),), "fast")
+
+
+def write(out, run, returns, steps=1000, imagined=None, seconds=60.0):
+    """The metrics of a run with these returns, one iteration each."""
+    rows = [
+        {
+            "iteration": i + 1,
+            "real_steps": steps * (i + 1),
+            "return_real": float(r),
+            "return_imagined": float(r if imagined is None else imagined[i]),
+            "wall_seconds": seconds * (i + 1),
+        }
+        for i, r in enumerate(returns)
+    ]
+    directory = Path(out) / run.name
+    directory.mkdir(parents=True)
+    (directory / "metrics.csv").write_text(to_csv(rows))
+    (directory / "config.json").write_text(to_json(run.config))
+
+
+def runs(system, seeds, task="Swimmer", iterations=3):
+    return [Run(task, system, seed, (("iterations", iterations),), "fast") for seed in range(seeds)]
+
+
+# ---------------------------------------------------------------- the tables
+
+
+def test_every_system_is_in_a_figure_and_every_figure_has_its_systems():
+    named = {system for figure in FIGURES.values() for system in figure.systems.values()}
+    assert named == set(SYSTEMS)
+    for figure in FIGURES.values():
+        assert set(figure.tasks) <= set(tasks())
+        assert len(set(figure.systems.values())) == len(figure.systems)
+    for scale in SCALES.values():
+        assert set(scale.tasks) <= set(tasks())
+        assert {s for row in scale.iterations.values() for s in row} <= set(SYSTEMS) | {"*"}
+        assert set(scale.iterations) <= set(tasks()) | {"*"}
+        assert set(scale.without) <= set(SYSTEMS)
+    assert set(PAPER_SECONDS) == set(FIGURES["wall-clock"].tasks)
+
+
+def test_smoke_runs_every_system_once():
+    found = runs_of("all", "smoke")
+    assert sorted(r.system for r in found) == sorted(SYSTEMS)
+
+
+def test_the_paper_scale_is_the_papers_settings():
+    for run in runs_of("all", "paper"):
+        assert run.config == preset(run.task, "paper", run.system, seed=run.seed)
+    assert {r.task for r in runs_of("comparison", "paper")} == set(FIGURES["comparison"].tasks)
+
+
+def test_figures_share_runs_and_the_first_seeds_come_first():
+    found = runs_of("all", "laptop")
+    assert len(found) == len(set(found))
+    assert [r.seed for r in found] == sorted(r.seed for r in found)
+    one = runs_of("ensemble-size", "laptop", ("Swimmer",), seeds=1)
+    assert [r.name for r in one] == [f"Swimmer/{s}/seed-0" for s in ("me-trpo", "k-1", "k-10")]
+    assert set(one) <= set(found)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("sampling", "huge"), "scale: expected one of smoke, laptop, paper, got 'huge'"),
+        (("speed", "smoke"), "figure: expected one of all, comparison, .*, got 'speed'"),
+        (("sampling", "smoke", ("Hopper",)), "tasks: expected some of HalfCheetah, Swimmer, got Hopper"),
+    ],
+)
+def test_what_is_unknown_is_named(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        runs_of(*arguments)
+
+
+@pytest.mark.parametrize("scale", list(SCALES))
+def test_the_command_of_a_run_is_its_config(scale, monkeypatch):
+    """`metrpo train ...` with these arguments trains exactly this."""
+    monkeypatch.setattr(machine, "prepare", lambda *_: None)
+    for run in runs_of("all", scale, seeds=1):
+        parsed = options.parse(["train", *run.arguments])
+        assert Config(**{f.name: getattr(parsed, f.name) for f in dataclasses.fields(Config)}) == run.config
+
+
+# ---------------------------------------------------------------- running them
+
+TRAIN = """
+import pathlib, sys, time
+directory, iterations, code = pathlib.Path(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3])
+time.sleep(float(sys.argv[4]))
+lines = ["iteration,real_steps,return_real"] + [f"{i + 1},{10 * (i + 1)},1.5" for i in range(iterations)]
+(directory / "metrics.csv").write_text("\\n".join(lines) + "\\n")
+print("what went wrong")
+sys.exit(code)
+"""
+
+
+@pytest.fixture
+def trained(monkeypatch):
+    """Stands in for `metrpo train`: {run: (iterations it gets to, exit code, seconds)}; and the runs that were begun."""
+    outcomes, begun = {}, []
+
+    def command(run, directory):
+        begun.append(run)
+        words = outcomes.get(run, (run.config.iterations, 0, 0))
+        return [sys.executable, "-c", TRAIN, str(directory), *map(str, words)]
+
+    monkeypatch.setattr(running, "_command", command)
+    monkeypatch.setattr(running, "_POLL", 0.02)
+    return outcomes, begun
+
+
+def test_only_what_is_missing_is_run(tmp_path, trained):
+    _, begun = trained
+    told = []
+    first, second, third = runs("k-1", 3)
+    write(tmp_path, first, [1, 2, 3])
+    write(tmp_path, second, [1, 2])
+    assert running.reproduce([first, second, third], tmp_path, 2, told.append) == []
+    assert begun == [second, third]
+    assert told[0] == "1 of 3 runs are finished; 2 to go, 2 at a time"
+    assert sum("return 1.5" in line for line in told) == 2
+    begun.clear()
+    assert running.reproduce([first, second, third], tmp_path, 2, told.append) == []
+    assert begun == []
+
+
+def test_a_run_that_fails_does_not_stop_the_others_and_is_told_with_its_last_words(tmp_path, trained):
+    outcomes, begun = trained
+    all_runs = runs("k-1", 4)
+    outcomes[all_runs[0]] = (1, 2, 0)
+    outcomes[all_runs[1]] = (2, 0, 0)  # ends without an error, but short of its budget
+    told = []
+    assert set(running.reproduce(all_runs, tmp_path, 1, told.append)) == set(all_runs[:2])
+    assert begun == all_runs
+    text = "\n".join(told)
+    assert "Swimmer/k-1/seed-0: FAILED" in text
+    assert "exit code 2" in text
+    assert "what went wrong" in text
+    assert "[4/4] Swimmer/k-1/seed-3" in text
+
+
+def test_as_many_at_a_time_as_jobs(tmp_path, trained):
+    outcomes, _ = trained
+    all_runs = runs("k-1", 4)
+    outcomes.update({run: (3, 0, 0.5) for run in all_runs})
+    started = time.monotonic()
+    running.reproduce(all_runs, tmp_path, 4, lambda line: None)
+    assert time.monotonic() - started < 1.9, "one after the other takes two seconds"
+
+
+def test_stopping_ends_the_runs_too(tmp_path, trained, monkeypatch):
+    outcomes, begun = trained
+    run = RUN
+    outcomes[run] = (3, 0, 60)
+    processes = []
+    start = subprocess.Popen
+
+    def remembered(*arguments, **options):
+        processes.append(start(*arguments, **options))
+        threading.Timer(0.3, signal.raise_signal, [signal.SIGINT]).start()
+        return processes[-1]
+
+    monkeypatch.setattr(running.subprocess, "Popen", remembered)
+    with pytest.raises(KeyboardInterrupt):
+        running.reproduce([run], tmp_path, 1, lambda line: None)
+    assert processes[0].poll() == -signal.SIGTERM
+    assert begun == [run]
+
+
+def test_cores_are_shared_without_overlap(monkeypatch):
+    monkeypatch.setattr(running.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    assert running._shares_of_cores(2) == [(0, 1, 2, 3), (4, 5, 6, 7)]
+    assert running._shares_of_cores(8) == [(n,) for n in range(8)]
+    assert running._shares_of_cores(10)[8:] == [(0,), (1,)]
+
+
+def test_other_settings_on_disk_are_found(tmp_path):
+    write(tmp_path, RUN, [1, 2, 3])
+    assert running.differences(RUN, tmp_path) == {}
+    other = dataclasses.replace(RUN, overrides=(("iterations", 3), ("trpo.max_kl", 0.5)))
+    assert running.differences(other, tmp_path) == {"trpo.max_kl": (0.03, 0.5)}
+
+
+# ---------------------------------------------------------------- numbers and pictures
+
+
+def test_numbers_of_a_figure_by_hand(tmp_path):
+    ours, one = runs("me-trpo", 2, iterations=4), runs("k-1", 2, iterations=2)
+    write(tmp_path, ours[0], [0, 10, 20, 20])
+    write(tmp_path, ours[1], [0, 20, 20, 20])
+    write(tmp_path, one[0], [0, 4])
+    write(tmp_path, one[1], [20, 20])
+    first, second = summarise("ensemble-size", [*ours, *one], tmp_path)
+    assert (first["system"], second["system"]) == ("5 models", "1 model")
+    assert first["last"] == [20, 20]
+    assert second["real_steps"] == second["common_steps"] == first["common_steps"] == 2000
+    assert first["real_steps"] == 4000
+    assert first["at_common"] == [10, 20]
+    assert second["at_common"] == [4, 20]
+    assert first["at_common_iqm"] == [15, 10, 20]
+    np.testing.assert_allclose(first["average"], [5, 10])
+    np.testing.assert_allclose(second["average"], [2, 20])
+    # 10 > 4, 20 > 4, 20 = 20 (half), 10 < 20; averages: both > 2, both < 20.
+    assert second["first_better"] == [2.5 / 4, 0.5]
+    assert first["first_better"] == [0.5, 0.5]
+    assert first["level"] == 19
+    assert first["steps"] == pytest.approx((2900 + 1950) / 2)
+    assert np.isnan(second["steps"]), "one seed never got there"
+    assert first["ratio"] == 1
+
+
+def test_without_the_first_system_there_is_nothing_to_compare_with(tmp_path):
+    (run,) = runs("k-1", 1)
+    write(tmp_path, run, [1, 2, 3])
+    (record,) = summarise("ensemble-size", [run], tmp_path)
+    assert "first_better" not in record
+    assert record["last"] == [3]
+
+
+def test_the_mean_curve_is_over_what_all_seeds_have_measured(tmp_path):
+    a, b, c = runs("k-1", 3)
+    write(tmp_path, a, [0, 1, 2])
+    write(tmp_path, b, [2, 3, 4])
+    write(tmp_path, c, [4, 5])
+    (curves,) = curves_of("ensemble-size", [a, b, c], tmp_path)
+    for log in (False, True):
+        steps, mean, low, high = mean_curve(curves, "return_real", log)
+        assert (steps[0], steps[-1]) == pytest.approx((1000, 2000))
+        np.testing.assert_allclose(mean, 1 + steps / 1000, atol=1e-6)
+        assert np.all(low < mean)
+        assert np.all(mean < high)
+        assert np.all(high <= 4 + steps)
+
+
+@pytest.mark.parametrize("name", list(FIGURES))
+def test_every_figure_is_drawn_from_what_there_is(tmp_path, name):
+    everything = [r for r in runs_of(name, "laptop") if r.system != "svg-1"]
+    assert not draw(name, everything, tmp_path, tmp_path / "none.png")
+    assert not (tmp_path / "none.png").exists()
+    for i, run in enumerate(everything[1:]):
+        write(tmp_path, run, np.arange(3 + i % 4), imagined=np.arange(3 + i % 4) * 5)
+    assert draw(name, everything, tmp_path, tmp_path / "some.png")
+    assert (tmp_path / "some.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_publishing_says_what_is_missing_and_shows_all_seeds_there_are(tmp_path):
+    a, b, c = runs("me-trpo", 3)
+    write(tmp_path, a, [0, 1, 2])
+    write(tmp_path, c, [0, 3])
+    other = dataclasses.replace(a, overrides=(*a.overrides, ("trpo.max_kl", 0.5)))
+    told = []
+    numbers = publish(["ensemble-size", "sampling"], [other, b], tmp_path, told.append)
+    assert numbers["ensemble-size"][0]["last"] == [2, 3], "seed 2 was not asked for, but is there"
+    assert json.loads((tmp_path / "figures" / "ensemble-size.json").read_text())[0]["seeds"] == 2
+    assert "| Swimmer | 5 models | 2,000 | 2.5 (2.0, 3.0) |" in (
+        tmp_path / "figures" / "sampling.md"
+    ).read_text().replace("step_rand", "5 models")
+    text = "\n".join(told)
+    assert "Swimmer/me-trpo/seed-1: not begun" in text
+    assert "Swimmer/me-trpo/seed-2: not finished, 2,000 real steps so far" in text
+    assert "Swimmer/me-trpo/seed-0: made with other settings: trpo.max_kl 0.03 (today 0.5)" in text
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1500)
+def test_smoke_runs_every_system_and_draws_every_figure(tmp_path):
+    """The command itself; without Stable-Baselines3 its two systems fail, and nothing else does."""
+    done = subprocess.run(
+        [sys.executable, "-m", "metrpo", "reproduce", "all", "--scale", "smoke", "--out", str(tmp_path)],
+        capture_output=True,
+        text=True,
+    )
+    failed = {line.split(":")[0].split("] ")[1] for line in done.stdout.splitlines() if "FAILED" in line}
+    try:
+        import stable_baselines3  # noqa: F401
+    except ImportError:
+        assert failed == {"Swimmer/ppo/seed-0", "Swimmer/ddpg/seed-0"}, done.stdout
+    else:
+        assert not failed, done.stdout
+        assert done.returncode == 0
+    for run in runs_of("all", "smoke"):
+        if run.name not in failed:
+            assert read_metrics(tmp_path / run.name / "metrics.csv")[-1]["iteration"] == 2
+    assert {p.stem for p in (tmp_path / "figures").glob("*.png")} == set(FIGURES)

@@ -1,0 +1,344 @@
+"""PPO and DDPG of Stable-Baselines3: exact states, exact resumes, exact exports, and that they learn."""
+
+from __future__ import annotations
+
+import sys
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+
+import jax
+import torch
+
+import probe
+from metrpo import training
+from metrpo.algorithm import evaluate
+from metrpo.baselines import sb3
+from metrpo.config import Config
+from metrpo.errors import MetrpoError
+from metrpo.policy import gaussian
+from metrpo.presets import override
+from metrpo.run import directory
+from metrpo.run.checkpoint import load_state, save_state
+from metrpo.run.policy_file import load_policy, save_policy
+from metrpo.run.progress import Progress
+from metrpo.run.report import draw_curve
+from metrpo.seeds import Stage
+from metrpo.world import task as task_module
+
+TINY = override(
+    Config(task="Probe", iterations=3, evaluation_episodes=2),
+    {"collect.steps": 128, "policy.hidden": (8, 6), "policy.initial_std": 0.5},
+)
+METHODS = pytest.mark.parametrize("method", ["ppo", "ddpg"])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _probe_is_a_task():
+    with pytest.MonkeyPatch.context() as patch:
+        for task in (probe.PROBE, probe.ENDING_PROBE):
+            patch.setitem(task_module._TASKS, task.name, task)
+        yield
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """By method: the states of three iterations (the first included) and their rows."""
+    return {method: run(override(TINY, {"method": method}), 3) for method in ("ppo", "ddpg")}
+
+
+def run(config, iterations):
+    states, rows = [sb3.init(config)], []
+    for _ in range(iterations):
+        state, row = sb3.step(config, states[-1])
+        states.append(state)
+        rows.append(row)
+    return states, rows
+
+
+def equal(one, other):
+    return jax.tree.all(jax.tree.map(lambda a, b: np.array_equal(a, b), one, other))
+
+
+def shapes(state):
+    """Names, dtypes and ranks: what a checkpoint must find again."""
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    return {jax.tree_util.keystr(path): (np.asarray(x).dtype, np.ndim(x)) for path, x in leaves}
+
+
+# ---------------------------------------------------------------- states
+
+
+@METHODS
+def test_the_config_fixes_the_structure_of_the_state(runs, method):
+    states, rows = runs[method]
+    for state in states[1:]:
+        assert shapes(state) == shapes(states[0])
+        assert jax.tree.structure(state) == jax.tree.structure(states[0])
+    assert all(isinstance(x, int | np.ndarray) for x in jax.tree.leaves(states[2]))
+    assert len({tuple(row) for row in rows}) == 1
+
+
+@METHODS
+def test_the_networks_and_adam_change_and_are_kept(runs, method):
+    (first, second, _, last), _ = runs[method]
+    assert not any(np.any(x) for x in jax.tree.leaves(first.adam))
+    assert all(np.any(x) for x in jax.tree.leaves(second.adam))
+    for name, before in first.parameters.items():
+        assert not np.array_equal(before, second.parameters[name]), name
+    # PPO: 10 passes of 2 minibatches; DDPG: 50 updates after step 100, and 50 after step 200
+    each = {"ppo": 20, "ddpg": 100}[method]
+    for state, counted in ((second, each), (last, 3 * each)):
+        assert {int(step) for optimiser in state.adam for step, _, _ in optimiser} == {counted}
+
+
+@METHODS
+def test_the_state_goes_into_the_librarys_objects_and_comes_out_again(runs, method):
+    config, state = override(TINY, {"method": method}), runs[method][0][3]
+    env = sb3._environment(config)
+    assert equal(sb3._state(config, sb3._model(config, env, 0, state), 3), state)
+    env.close()
+
+
+@METHODS
+def test_a_step_leaves_its_state_as_it_was_and_can_be_taken_again(runs, method):
+    config, (states, rows) = override(TINY, {"method": method}), runs[method]
+    before = jax.tree.map(np.array, states[1])
+    again, row = sb3.step(config, states[1])
+    assert equal(states[1], before)
+    assert equal(again, states[2])
+    assert {n: x for n, x in row.items() if "seconds" not in n} == {
+        n: x for n, x in rows[1].items() if "seconds" not in n
+    }
+
+
+@METHODS
+def test_a_checkpoint_gives_the_state_back_and_the_run_goes_on_as_if_uninterrupted(runs, method, tmp_path):
+    config, (states, _) = override(TINY, {"method": method}), runs[method]
+    save_state(tmp_path / "state.npz", states[2], {})
+    # Nothing may hang on what this process has drawn before.
+    torch.manual_seed(99)
+    np.random.seed(99)
+    state, _ = load_state(tmp_path / "state.npz", sb3.init(config))
+    assert equal(state, states[2])
+    assert all(isinstance(x, int | np.ndarray) for x in jax.tree.leaves(state))
+    resumed, _ = sb3.step(config, state)
+    assert equal(resumed, states[3])
+
+
+@METHODS
+def test_a_stopped_run_directory_is_resumed_exactly(runs, method, tmp_path, monkeypatch):
+    monkeypatch.setattr(directory, "draw_curve", lambda *_: None)
+    config = override(TINY, {"method": method, "deterministic": True, "iterations": 2})
+    whole = training.train(config, tmp_path / "whole")
+    training.train(override(config, {"iterations": 1}), tmp_path / "parts")
+    resumed = training.train(config, tmp_path / "parts")
+    assert equal(resumed, whole)
+    assert equal(whole, runs[method][0][2])
+    csvs = [(tmp_path / name / "metrics.csv").read_text() for name in ("whole", "parts")]
+    assert csvs[0] == csvs[1]
+
+
+@METHODS
+def test_the_seed_decides_the_whole_run(runs, method):
+    states, rows = run(override(TINY, {"method": method, "seed": 1}), 1)
+    assert not equal(states[0].policy, runs[method][0][0].policy)
+    assert not equal(states[1].policy, runs[method][0][1].policy)
+    assert rows[0]["return_collected"] != runs[method][1][0]["return_collected"]
+
+
+# ---------------------------------------------------------------- policies
+
+
+@METHODS
+def test_the_exported_policy_acts_as_stable_baselines3_predicts(runs, method, tmp_path):
+    config, state = override(TINY, {"method": method}), runs[method][0][3]
+    states = np.random.default_rng(0).normal(scale=3.0, size=(1000, 2)).astype(np.float32)
+    env = sb3._environment(config)
+    expected, _ = sb3._model(config, env, 0, state).predict(states, deterministic=True)
+    env.close()
+    np.testing.assert_allclose(np.clip(gaussian.mean(state.policy, states), -1, 1), expected, atol=1e-5)
+    save_policy(tmp_path, state.policy, "Probe", 3, state.real_steps, None)
+    np.testing.assert_allclose(load_policy(tmp_path)(states), expected, atol=1e-5)
+    assert np.ptp(expected) > 0.02, "the policy must not be the same everywhere"
+    assert [len(b) for _, b in state.policy.layers] == {"ppo": [8, 6, 2], "ddpg": [8, 6, 2, 2]}[method]
+
+
+def test_the_initial_std_is_the_configs(runs):
+    np.testing.assert_allclose(np.exp(runs["ppo"][0][0].policy.log_std), TINY.policy.initial_std, rtol=1e-6)
+    np.testing.assert_allclose(np.exp(runs["ddpg"][0][0].policy.log_std), sb3.DDPG_NOISE, rtol=1e-6)
+
+
+# ---------------------------------------------------------------- real steps and episodes
+
+
+class Counted:
+    """Every step and every start of the probe, evaluations included."""
+
+    def __init__(self, patch):
+        self.steps, self.starts = 0, []
+        step, reset = probe.ProbeEnv.step, probe.ProbeEnv.reset
+
+        def counted_step(env, action):
+            self.steps += 1
+            return step(env, action)
+
+        def counted_reset(env, **kwargs):
+            state, info = reset(env, **kwargs)
+            self.starts.append(state.tobytes())
+            return state, info
+
+        patch.setattr(probe.ProbeEnv, "step", counted_step)
+        patch.setattr(probe.ProbeEnv, "reset", counted_reset)
+
+
+@pytest.mark.parametrize(
+    ("method", "steps", "taken"),
+    [
+        ("ppo", 100, 128),
+        ("ppo", 64, 64),
+        ("ppo", 256, 256),
+        ("ppo", 257, 512),
+        ("ddpg", 30, 30),
+        ("ddpg", 130, 200),
+    ],
+)
+def test_real_steps_are_counted_one_by_one(monkeypatch, method, steps, taken):
+    """Whole updates: PPO's of whole minibatches of 64 and up to PPO_STEPS, DDPG's of up to 100 steps."""
+    counted = Counted(monkeypatch)
+    monkeypatch.setattr(sb3, "PPO_STEPS", 256)
+    config = override(TINY, {"method": method, "collect.steps": steps})
+    state, row = sb3.step(config, sb3.init(config))
+    evaluated = config.evaluation_episodes * probe.HORIZON
+    assert state.real_steps == row["real_steps"] == counted.steps - evaluated == taken
+    assert len(state.replay.get("rewards", [])) == (taken if method == "ddpg" else 0)
+    assert len(set(counted.starts)) == len(counted.starts), "every episode must start elsewhere"
+    assert probe.ProbeEnv.open_count == 0
+
+
+def test_every_iteration_starts_with_a_fresh_episode():
+    """30 steps are an episode of 20 and half of another, which is left there."""
+    states, _ = run(override(TINY, {"method": "ddpg", "collect.steps": 30}), 2)
+    replay = states[2].replay
+    firsts = np.flatnonzero((replay["observations"][1:] != replay["next_observations"][:-1]).any(axis=1)) + 1
+    np.testing.assert_array_equal(firsts, [20, 30, 50])
+    assert np.abs(replay["observations"][firsts]).max() <= probe.START
+
+
+def test_the_end_of_the_clock_is_no_end_and_the_tasks_is(runs):
+    assert not runs["ddpg"][0][3].replay["dones"].any()
+    states, _ = run(override(TINY, {"method": "ddpg", "task": "EndingProbe"}), 2)
+    replay = states[2].replay
+    np.testing.assert_array_equal(replay["dones"], probe.beyond(replay["next_observations"]))
+    assert 0 < replay["dones"].sum() < 400
+
+
+def test_ppo_values_what_follows_the_end_of_the_clock(monkeypatch):
+    """With gae_lambda 0 every advantage is r + gamma V(s') - V(s), also where the clock ended the episode."""
+    monkeypatch.setitem(sb3.PPO_SETTINGS, "gae_lambda", 0.0)
+    seen = {}
+
+    def train(model):
+        buffer = model.rollout_buffer
+        seen.update(first=buffer.episode_starts[:, 0], rewards=buffer.rewards[:, 0], states=buffer.observations[:, 0])
+        seen.update(actions=buffer.actions[:, 0], values=model.policy.predict_values)
+
+    monkeypatch.setattr(sb3.PPO, "train", train)
+    config = override(TINY, {"method": "ppo"})
+    sb3.step(config, sb3.init(config))
+    (last, *_) = np.flatnonzero(seen["first"][1:])
+    action = np.clip(seen["actions"][last], -1, 1).astype(float)
+    following = probe.A @ seen["states"][last] + probe.B @ action
+    value = seen["values"](torch.from_numpy(following[None].astype(np.float32))).item()
+    expected = probe.reward(None, action, following) + 0.99 * value
+    assert last == probe.HORIZON - 1
+    assert abs(value) > 1e-3
+    assert seen["rewards"][last] == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_replay_buffer_forgets_the_oldest_first(monkeypatch):
+    monkeypatch.setattr(sb3, "DDPG_BUFFER", 250)
+    config = override(TINY, {"method": "ddpg", "collect.steps": 100})
+    states, _ = run(config, 4)
+    assert [len(s.replay["rewards"]) for s in states] == [0, 100, 200, 250, 250]
+    for before, after in pairwise(states[2:]):
+        for name, values in after.replay.items():
+            np.testing.assert_array_equal(values[:150], before.replay[name][-150:])
+
+
+def test_no_episode_finished_is_no_return():
+    config = override(TINY, {"method": "ddpg", "collect.steps": 10})
+    _, row = sb3.step(config, sb3.init(config))
+    assert np.isnan(row["return_collected"])
+
+
+def test_progress_is_told_of_both_stages():
+    told = []
+
+    class Told(Progress):
+        def stage(self, name, total=None):
+            told.append((name, total))
+
+        def update(self, done, note=""):
+            told.append(done)
+
+    config = override(TINY, {"method": "ddpg"})
+    states, _ = run(config, 1)
+    _, row = sb3.step(config, states[1], Told())
+    assert told == [("learn", 128), 100, 200, ("evaluate", 2)]
+    assert row["seconds_collect"] > 0
+    assert row["seconds_improve"] > 0
+
+
+def test_the_curve_can_be_drawn_without_the_models_columns(runs, tmp_path):
+    draw_curve(runs["ppo"][1], tmp_path / "curve.png", "Probe")
+    assert (tmp_path / "curve.png").exists()
+
+
+# ---------------------------------------------------------------- settings
+
+
+@METHODS
+def test_the_algorithm_has_the_settings_named(method):
+    config = override(TINY, {"method": method})
+    env = sb3._environment(config)
+    model = sb3._model(config, env, sb3._seed(config, 0, Stage.INIT), None)
+    env.close()
+    sizes = {name: tuple(x.shape) for name, x in model.policy.named_parameters() if name.endswith("weight")}
+    if method == "ppo":
+        assert (model.n_steps, model.batch_size, model.n_epochs, model.gae_lambda) == (128, 64, 10, 0.95)
+        assert (model.gamma, model.clip_range(1.0), model.learning_rate) == (0.99, 0.2, 3e-4)
+        assert sizes["mlp_extractor.value_net.2.weight"] == (6, 8)
+    else:
+        assert (model.gamma, model.tau, model.batch_size, model.learning_starts) == (0.99, 0.01, 64, 64)
+        assert (model.train_freq.frequency, model.gradient_steps, model.policy_delay) == (100, 50, 1)
+        model._update_learning_rate([model.actor.optimizer, model.critic.optimizer])
+        assert [o.param_groups[0]["lr"] for o in sb3._optimisers(model)] == [1e-4, 1e-3]
+        assert sizes["critic.qf0.2.weight"] == (64, 64)
+    assert torch.get_num_threads() == 1
+
+
+@pytest.mark.parametrize("library", ["torch", "stable_baselines3"])
+def test_without_its_libraries_the_error_says_what_to_install(monkeypatch, library):
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(sys.modules, "metrpo.baselines.sb3")
+    with pytest.raises(MetrpoError, match=r"make baselines.*torch==2\.13\.0.*metrpo\[baselines\]"):
+        training.init(override(TINY, {"method": "ppo"}))
+
+
+@pytest.mark.slow
+@METHODS
+def test_it_learns_the_probe(method):
+    """After 12,288 real steps within twice the optimum's loss; untrained policies lose more than ten times as much."""
+    config = override(TINY, {"method": method, "collect.steps": 2048, "policy.hidden": (16, 16)})
+    config = override(config, {"evaluation_episodes": 20})
+    states, rows = run(config, 6)
+    p, _ = probe.riccati()
+    optimum = np.mean([-s @ p @ s for s in probe.starts(100)])
+    untrained = np.mean(evaluate(config, probe.PROBE, states[0].policy, 1))
+    after = rows[-1]["return_real"]
+    assert untrained < 10 * optimum
+    assert after > 2 * optimum
