@@ -4,7 +4,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup train test test-slow lock clean
+.PHONY: help setup baselines train test test-slow lock clean
 
 PYTHON ?=
 RUN_DIR ?=
@@ -35,6 +35,11 @@ test-slow: $(READY)  ## the tests that learn for minutes
 	$(BIN)/pytest -m slow --timeout=1800
 
 setup: $(READY)  ## only set up .venv
+
+# PyTorch by itself first, so that one that is installed already is kept. Not in the lock file: nothing else needs it.
+baselines: $(READY)  ## add what the systems ppo and ddpg need (PyTorch, Stable-Baselines3)
+	$(BIN)/python -m pip install --disable-pip-version-check torch==2.13.0
+	$(BIN)/python -m pip install --disable-pip-version-check 'stable-baselines3>=2.7'
 
 lock:  ## take the newest versions into requirements.lock (needs uv; no other target does)
 	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --fork-strategy requires-python \
