@@ -31,7 +31,8 @@ SYSTEMS: dict[str, Overrides] = {
     "k-1": _VANILLA,
     "k-10": {"ensemble.members": 10},
     "k-20": {"ensemble.members": 20},
-    # Figure "optimization-comparison": ways to improve the policy with one model (TRPO is k-1).
+    # Figure "optimization-comparison": ways to improve the policy with one model (TRPO is k-1). bptt is the paper's
+    # Algorithm 1, vanilla model-based reinforcement learning.
     "model-ppo": _VANILLA | {"improver": "ppo"},
     "model-vpg": _VANILLA | {"improver": "vpg", "gradient.learning_rate": 1e-2},
     "bptt": _VANILLA | {"improver": "bptt", "gradient.learning_rate": 1e-3},

@@ -150,7 +150,7 @@ class RunDirectory:
         result = self.rows[-1].get("return_real")
         result = result if result is not None and math.isfinite(result) else None
         save_policy(self.path, state.policy, self.config.task, state.iteration, state.real_steps, result)
-        title = f"{self.config.task}, {self.config.preset}, seed {self.config.seed}"
+        title = f"{self.config.task}, {self.config.system}, {self.config.preset}, seed {self.config.seed}"
         self._derive("learning curve", lambda: draw_curve(self.rows, self.path / "curve.png", title))
         self._derive("TensorBoard events", self._write_events)
 

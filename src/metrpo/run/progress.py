@@ -118,8 +118,9 @@ def summary(row: Row) -> str:
     parts = [
         f"{row.get('real_steps', 0):>7,} real steps",
         f"return {_number(row.get('return_real')):>7} ± {_number(row.get('return_real_std'))}",
-        f"imagined {_number(row.get('return_imagined')):>7}",
     ]
+    if "return_imagined" in row:
+        parts.append(f"imagined {_number(row['return_imagined']):>7}")
     seconds = sum(v for name, v in row.items() if name.startswith("seconds_") and v is not None)
     return "  ".join([*parts, duration(seconds)] if seconds else parts)
 

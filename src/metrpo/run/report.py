@@ -28,10 +28,13 @@ def draw_curve(rows: Sequence[Row], path: Path, title: str) -> None:
     )  # slow to import; without pyplot there is no global state and no display needed
 
     figure = Figure(figsize=(9, 7), dpi=150, layout="constrained")
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1])
     steps = _column(rows, "real_steps") / 1000
+    if any("gap" in row for row in rows):
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1])
+        _draw_gap(below, steps, rows)
+    else:  # a method without models
+        above = below = figure.subplots()
     _draw_returns(above, steps, rows)
-    _draw_gap(below, steps, rows)
     figure.suptitle(title, fontsize=14, fontweight="bold")
     best = _column(rows, "return_real")
     if np.isfinite(best).any():
@@ -40,7 +43,7 @@ def draw_curve(rows: Sequence[Row], path: Path, title: str) -> None:
             fontsize=10,
             color="#555555",
         )
-    for axes in (above, below):
+    for axes in {above, below}:
         _tidy(axes)
     below.set_xlabel("real steps (thousands)")
     below.set_xlim(left=0)
@@ -64,15 +67,8 @@ def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
         linewidth=1,
         label="collected (with exploration noise)",
     )
-    axes.plot(
-        steps,
-        imagined,
-        "s-",
-        color=_IMAGINED,
-        linewidth=1.3,
-        markersize=4,
-        label="imagined (models)",
-    )
+    if np.isfinite(imagined).any():
+        axes.plot(steps, imagined, "s-", color=_IMAGINED, linewidth=1.3, markersize=4, label="imagined (models)")
     axes.plot(steps, real, "o-", color=_REAL, linewidth=2.2, markersize=5, label="real (deterministic policy)")
     axes.set_ylabel("return of an episode")
     axes.set_ylim(_frame(np.concatenate([real - std, real + std, collected]), imagined))
