@@ -1,4 +1,4 @@
-"""The results table of the README, from the committed metrics: `python benchmarks/summarise.py [results/fast ...]`.
+"""Results as a table, from the committed metrics: `python benchmarks/summarise.py [results/laptop/*/me-trpo ...]`.
 
 One row for each task and system under the given folders: over seeds, the last and the best real return (deterministic
 policy, mean of 20 episodes), the real steps they took, and the minutes of wall-clock time.

@@ -280,9 +280,13 @@ def test_publishing_says_what_is_missing_and_shows_all_seeds_there_are(tmp_path)
     write(tmp_path, c, [0, 3])
     other = dataclasses.replace(a, overrides=(*a.overrides, ("trpo.max_kl", 0.5)))
     told = []
-    numbers = publish(["ensemble-size", "sampling"], [other, b], tmp_path, told.append)
+    write(tmp_path, Run("Ant", "me-trpo", 0, (), "fast"), [7])
+    numbers = publish(["ensemble-size", "sampling"], "laptop", (), [other, b], tmp_path, told.append)
     assert numbers["ensemble-size"][0]["last"] == [2, 3], "seed 2 was not asked for, but is there"
+    assert numbers["ensemble-size"][1]["task"] == "Ant", "nor was this task"
     assert json.loads((tmp_path / "figures" / "ensemble-size.json").read_text())[0]["seeds"] == 2
+    only = publish(["ensemble-size"], "laptop", ("Ant",), [], tmp_path, lambda line: None)
+    assert [record["task"] for record in only["ensemble-size"]] == ["Ant"]
     table = (tmp_path / "figures" / "sampling.md").read_text()
     assert "| Swimmer | step_rand | 2,000 | 2.5 (2.0, 3.0) |" in table
     text = "\n".join(told)

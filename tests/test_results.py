@@ -8,6 +8,10 @@ import pytest
 
 from metrpo import read_metrics
 from metrpo.bench.report import Report
+from metrpo.experiments.figures import FIGURES
+from metrpo.experiments.reproduce import runs_there
+from metrpo.experiments.summary import as_markdown
+from metrpo.experiments.summary import summarise as summarise_figure
 
 ROOT = Path(__file__).resolve().parents[1]
 RUNS = sorted(path.parent for path in (ROOT / "results").glob("*/*/*/seed-*/metrics.csv"))
@@ -29,10 +33,28 @@ def test_a_result_is_whole(run):
     assert [row["iteration"] for row in rows] == list(range(1, len(rows) + 1))
 
 
-def test_the_readmes_table_is_the_one_that_the_metrics_give():
+@pytest.mark.parametrize(
+    ("page", "folders"),
+    [
+        ("README.md", ["laptop/*/me-trpo"]),
+        ("docs/fast-preset.md", ["ensemble-size", "fast-before", "fast-choices"]),
+    ],
+)
+def test_a_table_is_the_one_that_the_metrics_give(page, folders):
     summarise = runpy.run_path(str(ROOT / "benchmarks" / "summarise.py"))
-    table = summarise["table"]([ROOT / "results"])
-    assert table in (ROOT / "README.md").read_text(), "run: python benchmarks/summarise.py, and put the table in"
+    table = summarise["table"]([path for pattern in folders for path in (ROOT / "results").glob(pattern)])
+    assert table in (ROOT / page).read_text(), "run: python benchmarks/summarise.py, and put the table in"
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_figures_table_is_the_one_that_the_metrics_give(name):
+    """The page of the reproduction and the files beside the pictures."""
+    out = ROOT / "results" / "laptop"
+    table = as_markdown(summarise_figure(name, runs_there(name, "laptop", (), out), out))
+    again = "run: metrpo reproduce all --out results/laptop --no-run"
+    assert (out / "figures" / f"{name}.md").read_text().strip() == table, again
+    assert table in (ROOT / "docs" / "reproduction.md").read_text(), again
+    assert (out / "figures" / f"{name}.png").stat().st_size > 0
 
 
 def test_the_performance_table_is_the_recorded_one():

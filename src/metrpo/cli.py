@@ -165,7 +165,7 @@ def _reproduce(command: Reproduce) -> int:
     except (KeyboardInterrupt, _Terminated):
         print(f"metrpo: stopped; {out} keeps every finished iteration. The same command goes on.", file=sys.stderr)
         raise
-    numbers = publish(names, runs, out, tell)
+    numbers = publish(names, command.scale, command.tasks, runs, out, tell)
     if command.json:
         print(json.dumps(numbers))
     if failed:

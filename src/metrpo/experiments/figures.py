@@ -218,13 +218,14 @@ def runs_of(figure: str, scale: str, tasks: tuple[str, ...] = (), seeds: int | N
             for task in FIGURES[name].tasks:
                 if task in (tasks or of.tasks):
                     systems = [s for s in FIGURES[name].systems.values() if s not in of.without]
-                    found |= {_run(of, task, system, seed): None for system in systems}
+                    found |= {run_of(scale, task, system, seed): None for system in systems}
     return list(found)
 
 
-def _run(scale: Scale, task: str, system: str, seed: int) -> Run:
-    iterations = None
-    for row in (scale.iterations.get("*", {}), scale.iterations.get(task, {})):
+def run_of(scale: str, task: str, system: str, seed: int) -> Run:
+    """The run of a task, system and seed at a scale."""
+    of, iterations = SCALES[scale], None
+    for row in (of.iterations.get("*", {}), of.iterations.get(task, {})):
         iterations = row.get(system, row.get("*", iterations))
-    overrides = scale.overrides | ({} if iterations is None else {"iterations": iterations})
-    return Run(task, system, seed, tuple(overrides.items()), scale.preset)
+    overrides = of.overrides | ({} if iterations is None else {"iterations": iterations})
+    return Run(task, system, seed, tuple(overrides.items()), of.preset)

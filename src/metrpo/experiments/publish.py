@@ -9,32 +9,35 @@ from typing import Any
 
 from metrpo.experiments.draw import draw
 from metrpo.experiments.figures import FIGURES, Run
-from metrpo.experiments.reproduce import differences, is_finished, rows_of, with_other_seeds
+from metrpo.experiments.reproduce import differences, is_finished, rows_of, runs_there
 from metrpo.experiments.summary import as_markdown, summarise
 from metrpo.run.files import atomic_write
 
 
 def publish(
-    names: Sequence[str], runs: Sequence[Run], out: Path, tell: Callable[[str], None]
+    names: Sequence[str],
+    scale: str,
+    tasks: tuple[str, ...],
+    asked: Sequence[Run],
+    out: Path,
+    tell: Callable[[str], None],
 ) -> dict[str, list[dict[str, Any]]]:
     """Draws the named figures into `out`/figures, writes their numbers beside them and returns these.
 
-    Shows all seeds that have been run, also beyond those of `runs`.
-
-    Tells what is unfinished and which runs were made with other settings than today's. Raises `RunDirectoryError` when
-    a file cannot be written.
+    A figure shows all that has been run under `out`, of any seed, and of any of its tasks unless `tasks` names some.
+    Tells what of the runs `asked` for is missing and what was made with other settings than today's. Raises
+    `RunDirectoryError` when a file cannot be written.
     """
-    numbers: dict[str, list[dict[str, Any]]] = {}
-    runs = with_other_seeds(list(runs), out)
-    for run in runs:
+    shown = {name: runs_there(name, scale, tasks, out) for name in names}
+    for run in dict.fromkeys([*asked, *(run for runs in shown.values() for run in runs)]):
         _tell_about(run, out, tell)
-    for name in names:
+    numbers: dict[str, list[dict[str, Any]]] = {}
+    for name, runs in shown.items():
         path = out / "figures" / f"{name}.png"
-        shown = [r for r in runs if r.task in FIGURES[name].tasks]
-        if not draw(name, shown, out, path):
+        if not draw(name, runs, out, path):
             tell(f"{name}: nothing to draw yet")
             continue
-        numbers[name] = summarise(name, shown, out)
+        numbers[name] = summarise(name, runs, out)
         # A level that was not reached is NaN, which is no JSON.
         text = json.dumps(numbers[name], indent=1).replace("NaN", "null")
         atomic_write(path.with_suffix(".json"), text + "\n")

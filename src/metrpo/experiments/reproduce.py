@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from pathlib import Path
 
 from metrpo.config import difference, from_json
 from metrpo.errors import MetrpoError
-from metrpo.experiments.figures import Run
+from metrpo.experiments.figures import FIGURES, Run, run_of
 from metrpo.run.metrics import Row, read_metrics
 from metrpo.run.progress import duration
 
@@ -59,16 +58,14 @@ def differences(run: Run, out: Path) -> dict[str, tuple[object, object]]:
     return difference(from_json(path.read_text()), run.config)
 
 
-def with_other_seeds(runs: list[Run], out: Path) -> list[Run]:
-    """The runs and those of the same tasks and systems that have been made with other seeds."""
-    found = {run.name: run for run in runs}
-    for run in runs:
-        for directory in sorted((out / run.name).parent.glob("seed-*")):
-            number = directory.name.removeprefix("seed-")
-            if number.isdecimal():
-                other = dataclasses.replace(run, seed=int(number))
-                found.setdefault(other.name, other)
-    return list(found.values())
+def runs_there(figure: str, scale: str, tasks: tuple[str, ...], out: Path) -> list[Run]:
+    """The runs of a figure that lie under `out`, of any seed; of all its tasks unless `tasks` names some."""
+    found = []
+    for task in tasks or FIGURES[figure].tasks:
+        for system in FIGURES[figure].systems.values():
+            numbers = [d.name.removeprefix("seed-") for d in (out / task / system).glob("seed-*/")]
+            found += [run_of(scale, task, system, seed) for seed in sorted(int(n) for n in numbers if n.isdecimal())]
+    return [run for run in found if rows_of(run, out)]
 
 
 def reproduce(runs: list[Run], out: Path, jobs: int, tell: Tell) -> list[Run]:
