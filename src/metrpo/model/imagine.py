@@ -45,7 +45,8 @@ def model_choice(key: Array, count: int, members: int) -> tuple[Array, Array]:
     # The deck is shuffled with its blanks, else the last model would be drawn less often than the others.
     deck = jax.random.permutation(key, group * members)
     slots = jnp.where(deck < count, deck, count).reshape(members, group)
-    models = jnp.zeros(count, jnp.int32).at[slots].set(jnp.arange(members)[:, None], mode="drop")
+    numbers = jnp.arange(members, dtype=jnp.int32)[:, None]
+    models = jnp.zeros(count, jnp.int32).at[slots].set(numbers, mode="drop")
     return slots, models
 
 

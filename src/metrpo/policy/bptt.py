@@ -39,7 +39,8 @@ def improve(
 ) -> tuple[Policy, Any, tuple[ImproveInfo, Any]]:
     """One gradient step on the mean return of rollouts from `starts` [N, S] under `act` (one of the two above).
 
-    Rollouts that diverge count nothing. With `axis`, `starts` are this device's share (see `metrpo.devices`).
+    Rollouts that diverge count nothing; one that meets NaN makes the gradient NaN, and the update is refused. With
+    `axis`, `starts` are this device's share (see `metrpo.devices`).
     """
 
     def total_return(policy: Policy) -> tuple[Array, Any]:
