@@ -72,7 +72,7 @@ def init(config: Config) -> State:
         previous_policy=policy,
         networks=_fresh_networks(config, task, ensemble_key),
         baseline=advantage.init_baseline(task.state_size),
-        dataset=datasets.empty(task.state_size, task.action_size),
+        dataset=datasets.empty(task.state_size, task.action_size, len(task.learned)),
     )
 
 
@@ -87,7 +87,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
         mean = partial(_perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise)
         explorer = lambda rng: real.explore(mean(rng), config.collect, rng)  # noqa: E731
         episodes = real.collect(task, explorer, config.collect.steps, rng, progress.update)
-        dataset = datasets.add(state.dataset, episodes, config.collect, rng)
+        dataset = datasets.add(state.dataset, episodes, config.collect, rng, task.learned)
     with clock("fit"):
         progress.stage("fit", None)
         ensemble, fitted = _fit(config, task, state.networks, dataset, iteration, progress)
@@ -202,7 +202,7 @@ def _row(
 
 def _fresh_networks(config: Config, task: Task, key: Array) -> Networks:
     e = config.ensemble
-    return ensembles.init(key, e.members, task.state_size, task.action_size, e.hidden)
+    return ensembles.init(key, e.members, task.state_size, task.action_size, e.hidden, len(task.learned))
 
 
 def _host(policy: Policy) -> Policy:

@@ -32,7 +32,8 @@ class Transitions(NamedTuple):
     actions: Array
     """[C, A]"""
     deltas: Array
-    """[C, S], the change of state: next state - state."""
+    """[C, D], what the models predict: the change of state [S]; then, where they are learned, the reward, and 1 where
+    the task ended the episode, else 0."""
     size: Array
     """n, an integer (scalar array on the device)."""
 
@@ -49,9 +50,9 @@ class Normaliser(NamedTuple):
     action_scale: Array
     """[A], 1 / std."""
     delta_mean: Array
-    """[S]"""
+    """[D], of what the models predict."""
     delta_std: Array
-    """[S]"""
+    """[D]"""
 
 
 class Trajectories(NamedTuple):

@@ -19,6 +19,7 @@ import optax
 from metrpo.algorithm import Row, evaluate
 from metrpo.baselines import on_policy
 from metrpo.config import Config
+from metrpo.errors import ConfigError
 from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Ensemble, Networks, predict
 from metrpo.model.fit import loss_of, minibatch
@@ -67,6 +68,8 @@ class Path(NamedTuple):
 def init(config: Config) -> State:
     """The state before the first iteration."""
     task, p, e = get_task(config.task), config.policy, config.ensemble
+    if task.reward is None:
+        raise ConfigError(f"method: svg needs the reward of {task.name} as a formula, got a task that learns it")
     keys = jax.random.split(key_of(config.seed, 0, Stage.INIT), 3)
     policy = gaussian.init(keys[0], task.state_size, task.action_size, p.hidden, p.initial_std)
     networks = ensembles.init(keys[1], 1, task.state_size, task.action_size, e.hidden)
@@ -140,10 +143,12 @@ def value_gradient(
     time = jnp.arange(path.mask.size)
     residuals, noise = _inferred(ensemble, policy, path)
 
+    reward_of: Any = task.reward
+
     def one(policy: Policy, state: Array, noise: Array, residual: Array) -> tuple[Array, Array]:
         action = jnp.clip(gaussian.mean(policy, state) + jnp.exp(policy.log_std) * noise, -1.0, 1.0)
         following = _predict(ensemble, state, action) + residual
-        return following, task.reward(state, action, following)
+        return following, reward_of(state, action, following)
 
     def whole(policy: Policy) -> Array:
         def step(state: Array, given: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:

@@ -31,9 +31,14 @@ class Ensemble(NamedTuple):
         return int(self.networks[0][0].shape[0])
 
 
-def init(key: Array, members: int, state_size: int, action_size: int, hidden: tuple[int, ...]) -> Networks:
-    """Fresh networks: Xavier-uniform weights, zero biases. Member k depends on `key` and k alone, not on K."""
-    sizes = (state_size + action_size, *hidden, state_size)
+def init(
+    key: Array, members: int, state_size: int, action_size: int, hidden: tuple[int, ...], learned: int = 0
+) -> Networks:
+    """Fresh networks: Xavier-uniform weights, zero biases. Member k depends on `key` and k alone, not on K.
+
+    `learned` outputs are added to those of the state.
+    """
+    sizes = (state_size + action_size, *hidden, state_size + learned)
 
     def one(k: Array) -> Networks:
         keys = jax.random.split(jax.random.fold_in(key, k), len(sizes) - 1)
@@ -74,12 +79,16 @@ def normaliser_of(
 
 
 def predict(ensemble: Ensemble, states: Array, actions: Array) -> Array:
-    """Next states, each member for its own batch: [K, B, S], [K, B, A] -> [K, B, S]."""
-    return states + predict_delta(ensemble, states, actions)
+    """Next states and what else is learned, each member for its own batch: [K, B, S], [K, B, A] -> [K, B, D]."""
+    deltas = predict_delta(ensemble, states, actions)
+    size = states.shape[-1]
+    if deltas.shape[-1] == size:
+        return states + deltas
+    return jnp.concatenate([states + deltas[..., :size], deltas[..., size:]], axis=-1)
 
 
 def predict_delta(ensemble: Ensemble, states: Array, actions: Array) -> Array:
-    """Changes of state, each member for its own batch: [K, B, S], [K, B, A] -> [K, B, S]."""
+    """Changes of state and what else is learned, each member for its own batch: [K, B, S], [K, B, A] -> [K, B, D]."""
     n = ensemble.normaliser
     hidden = jnp.concatenate(
         [(states - n.state_mean) * n.state_scale, (actions - n.action_mean) * n.action_scale], axis=-1

@@ -1,13 +1,13 @@
 """Rollouts through the ensemble: the simulator in which the policy learns (paper, section 5).
 
-Sampling functions choose the next state: (ensemble, states [N, S], actions [N, A], keys) -> [N, S]. They stand in
-one table, `SAMPLINGS` (paper, appendix "Ensemble sampling methods").
+Sampling functions choose the next state: (ensemble, states [N, S], actions [N, A], keys) -> [N, D], the next state
+first and then what else is learned. They stand in one table, `SAMPLINGS` (paper, appendix "Ensemble sampling methods").
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from metrpo.model.ensemble import Ensemble, first_member, predict
 from metrpo.types import Act, Array, Trajectories
 
 Reward = Callable[[Array, Array, Array], Array]
-Terminated = Callable[[Array], Array]
+Terminated = Callable[[Array], Array] | Literal["learned"]
 
 EXPLODED = 1e6
 """A rollout with a state beyond this has diverged, as has one with a state that is not finite."""
@@ -75,7 +75,7 @@ def _of_drawn_models(ensemble: Ensemble, states: Array, actions: Array, key: Arr
     grouped = predict(
         ensemble, jnp.take(states, slots, axis=0, mode="clip"), jnp.take(actions, slots, axis=0, mode="clip")
     )
-    return jnp.zeros_like(states).at[slots].set(grouped, mode="drop")
+    return jnp.zeros((states.shape[0], grouped.shape[-1])).at[slots].set(grouped, mode="drop")
 
 
 def one_model(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
@@ -96,7 +96,7 @@ def model_med(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> 
 def model_mean_std(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
     """Drawn from N(mean, std^2) of all models' predictions, dimension by dimension."""
     predictions = _of_all_models(ensemble, states, actions)
-    noise = jax.random.normal(keys.step, states.shape)
+    noise = jax.random.normal(keys.step, predictions.shape[1:])
     # Not jnp.std: where all models agree, its gradient is NaN.
     variance = jnp.mean(jnp.square(predictions - jnp.mean(predictions, axis=0)), axis=0)
     std = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
@@ -120,10 +120,25 @@ SAMPLINGS: dict[str, Callable[[Ensemble, Array, Array, Keys], Array]] = {
 }
 
 
+def outcome(
+    reward: Reward | None, terminated: Terminated | None, states: Array, actions: Array, predicted: Array
+) -> tuple[Array, Array, Array | None]:
+    """Next states [..., S], rewards [...] and ends [...] (None: never) out of predictions [..., D].
+
+    A reward of None is the learned one; a learned end is predicted as its probability, and comes at one half.
+    """
+    size = states.shape[-1]
+    following = predicted[..., :size]
+    rewards = predicted[..., size] if reward is None else reward(states, actions, following)
+    if terminated == "learned":
+        return following, rewards, predicted[..., -1] > 0.5
+    return following, rewards, None if terminated is None else terminated(following)
+
+
 def imagine(
     ensemble: Ensemble,
     act: Act,
-    reward: Reward,
+    reward: Reward | None,
     terminated: Terminated | None,
     starts: Array,
     horizon: int,
@@ -145,13 +160,13 @@ def imagine(
         action_key, model_key = jax.random.split(key)
         actions = act(states, action_key)
         clipped = jnp.clip(actions, -1.0, 1.0)
-        following = next_state(ensemble, states, clipped, Keys(model_key, episode_key))
-        rewards = reward(states, clipped, following)
+        predicted = next_state(ensemble, states, clipped, Keys(model_key, episode_key))
+        following, rewards, ended = outcome(reward, terminated, states, clipped, predicted)
         bad = ~(jnp.all(jnp.abs(following) < EXPLODED, axis=-1) & jnp.isfinite(rewards))
         recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive)
         diverged = diverged | (bad & (alive > 0))
-        if terminated is not None:
-            alive = alive * (1.0 - terminated(following))
+        if ended is not None:
+            alive = alive * (1.0 - ended)
         # A diverged rollout stands still, so that it stays finite; it is masked below.
         following = jnp.where(bad[:, None], states, following)
         return (following, alive, diverged), recorded
@@ -170,7 +185,7 @@ def imagine(
 def returns_per_model(
     ensemble: Ensemble,
     act: Callable[[Array], Array],
-    reward: Reward,
+    reward: Reward | None,
     terminated: Terminated | None,
     starts: Array,
     horizon: int,
@@ -183,13 +198,13 @@ def returns_per_model(
     def step(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
         states, alive, total = carry
         actions = jnp.clip(act(states), -1.0, 1.0)
-        following = predict(ensemble, states, actions)
-        rewards = reward(states, actions, following)
+        predicted = predict(ensemble, states, actions)
+        following, rewards, ended = outcome(reward, terminated, states, actions, predicted)
         sound = jnp.all(jnp.abs(following) < EXPLODED, axis=-1) & jnp.isfinite(rewards)
         # A product with `alive` would let what follows the end through: 0 * inf is NaN.
         total = total + jnp.where(alive > 0, jnp.where(sound, rewards, jnp.nan), 0.0)
-        if terminated is not None:
-            alive = alive * (1.0 - terminated(following))
+        if ended is not None:
+            alive = alive * (1.0 - ended)
         return (following, alive, total), None
 
     states = jnp.broadcast_to(starts, (ensemble.members, *starts.shape))

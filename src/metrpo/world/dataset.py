@@ -19,18 +19,28 @@ class Dataset(NamedTuple):
     """[E, S], the first states of all real episodes: where imagined episodes start."""
 
 
-def empty(state_size: int, action_size: int) -> Dataset:
-    """A dataset without transitions."""
+def empty(state_size: int, action_size: int, learned: int = 0) -> Dataset:
+    """A dataset without transitions; `learned` columns more than the state are to be predicted."""
 
     def none() -> Transitions:
-        states = np.zeros((0, state_size), np.float32)
-        return Transitions(states, np.zeros((0, action_size), np.float32), states, 0)
+        states, actions, deltas = (
+            np.zeros((0, n), np.float32) for n in (state_size, action_size, state_size + learned)
+        )
+        return Transitions(states, actions, deltas, 0)
 
     return Dataset(none(), none(), np.zeros((0, state_size), np.float32))
 
 
-def add(dataset: Dataset, episodes: list[Episode], config: CollectConfig, rng: np.random.Generator) -> Dataset:
+def add(
+    dataset: Dataset,
+    episodes: list[Episode],
+    config: CollectConfig,
+    rng: np.random.Generator,
+    learned: tuple[str, ...] = (),
+) -> Dataset:
     """The dataset with `episodes` added, a share of them (whole ones) to the validation set.
+
+    `learned` names what is to be predicted besides the state (`Task.learned`).
 
     Both sets get at least one episode where there are two, so that a first, short collection can be validated.
     """
@@ -38,10 +48,11 @@ def add(dataset: Dataset, episodes: list[Episode], config: CollectConfig, rng: n
     held_out = min(max(1, round(config.validation_fraction * len(episodes))), len(episodes) - 1)
     validation = [episodes[i] for i in order[:held_out]]
     train = [episodes[i] for i in order[held_out:]]
+    # A single first episode serves for both: there is nothing else to validate on.
+    validation = validation or ([] if dataset.validation.size else train)
     return Dataset(
-        append(dataset.train, train, config.max_train),
-        # A single first episode serves for both: there is nothing else to validate on.
-        append(dataset.validation, validation or ([] if dataset.validation.size else train), config.max_validation),
+        append(dataset.train, train, config.max_train, learned),
+        append(dataset.validation, validation, config.max_validation, learned),
         np.concatenate([dataset.starts, *(e.states[:1] for e in episodes)]),
     )
 
@@ -58,9 +69,16 @@ def with_capacity(transitions: Transitions, capacity: int) -> Transitions:
     return Transitions(padded(t.states), padded(t.actions), padded(t.deltas), np.int32(t.size))
 
 
-def append(old: Transitions, episodes: list[Episode], most: int) -> Transitions:
+def append(old: Transitions, episodes: list[Episode], most: int, learned: tuple[str, ...] = ()) -> Transitions:
     """The transitions with those of `episodes` added; of more than `most` the oldest go."""
     states = np.concatenate([old.states, *(e.states[:-1] for e in episodes)])[-most:]
     actions = np.concatenate([old.actions, *(e.actions for e in episodes)])[-most:]
-    deltas = [np.diff(e.states, axis=0) for e in episodes]
-    return Transitions(states, actions, np.concatenate([old.deltas, *deltas])[-most:], len(states))
+    deltas = np.concatenate([old.deltas, *(_deltas(e, learned) for e in episodes)])[-most:]
+    return Transitions(states, actions, deltas, len(states))
+
+
+def _deltas(episode: Episode, learned: tuple[str, ...]) -> np.ndarray:
+    ends = np.zeros_like(episode.rewards)
+    ends[-1] = episode.terminated
+    columns = {"reward": episode.rewards, "end": ends}
+    return np.column_stack([np.diff(episode.states, axis=0), *(columns[name] for name in learned)])

@@ -335,6 +335,9 @@ class MujocoTask(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         self.task = get_task(task)
         self.render_mode = render_mode
         self._robot = _ROBOTS[self.task.name]
+        # Every task of this file has formulas.
+        self._reward: Any = self.task.reward
+        self._terminated: Any = self.task.terminated
         self.model = _compile(self._robot)
         self.data = mujoco.MjData(self.model)
         self.metadata = {**self.metadata, "render_fps": round(1 / (self._robot.timestep * self._robot.frame_skip))}
@@ -372,8 +375,8 @@ class MujocoTask(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         state, self._state = self._state, self._observe()
         if not np.isfinite(self._state).all():
             raise TaskError(f"{self.task.name}: the simulation diverged; reset() starts a new episode")
-        reward = float(self.task.reward(state, action, self._state))
-        terminated = self.task.terminated is not None and bool(self.task.terminated(self._state))
+        reward = float(self._reward(state, action, self._state))
+        terminated = self._terminated is not None and bool(self._terminated(self._state))
         return self._state.copy(), reward, terminated, False, {}
 
     def _observe(self) -> NDArray[np.float64]:

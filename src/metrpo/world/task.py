@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import gymnasium
 
@@ -27,18 +27,26 @@ class Task:
     """A; actions lie in [-1, 1]."""
     horizon: int
     """T, steps per episode."""
-    reward: Callable[[Array, Array, Array], Array]
-    """r(s, a, s'): [..., S], [..., A], [..., S] -> [...]; `a` within [-1, 1]; NumPy or JAX arrays alike."""
-    terminated: Callable[[Array], Array] | None = None
-    """Ends the episode in s': [..., S] -> [...] of bool; None: never."""
+    reward: Callable[[Array, Array, Array], Array] | None
+    """r(s, a, s'): [..., S], [..., A], [..., S] -> [...]; `a` within [-1, 1]; NumPy or JAX arrays alike. None: learned,
+    as one more output of every model."""
+    terminated: Callable[[Array], Array] | Literal["learned"] | None = None
+    """Ends the episode in s': [..., S] -> [...] of bool; "learned": one more output of every model; None: never."""
     unseen: tuple[int, ...] = ()
     """State dimensions kept from the dynamics networks' input (global position), but predicted all the same."""
     description: str = ""
     """One line for `metrpo tasks`."""
+    make: Callable[..., gymnasium.Env] | None = None
+    """Makes the environment, in place of `gymnasium.make(env_id)`."""
+
+    @property
+    def learned(self) -> tuple[str, ...]:
+        """What the models predict besides the state, in the order of their outputs: "reward", "end"."""
+        return ("reward",) * (self.reward is None) + ("end",) * (self.terminated == "learned")
 
     def make_env(self, **kwargs: Any) -> gymnasium.Env:
         """A fresh environment with the time limit of the task (`kwargs` such as `render_mode="rgb_array"`)."""
-        return gymnasium.make(self.env_id, **kwargs)
+        return self.make(**kwargs) if self.make else gymnasium.make(self.env_id, **kwargs)
 
 
 _TASKS: dict[str, Task] = {}
@@ -56,13 +64,23 @@ def tasks() -> dict[str, Task]:
 
 
 def get_task(name: str) -> Task:
-    """The task of that name (case does not matter).
+    """The task of that name: a registered one (case does not matter), or what `metrpo.world.resolve` makes of it.
 
-    Raises `TaskError` with the nearest names when there is none.
+    Raises `TaskError` with the nearest names when there is none, and when an environment cannot be used.
     """
     by_lower = {known.lower(): task for known, task in _TASKS.items()}
     if name.lower() in by_lower:
         return by_lower[name.lower()]
-    near = [by_lower[n].name for n in difflib.get_close_matches(name.lower(), by_lower, n=3, cutoff=0.4)]
+    from metrpo.world.resolve import resolve  # which makes tasks, and so imports this
+
+    found = resolve(name)
+    if found is not None:
+        return found
+    names = [*by_lower, *(known.lower() for known in gymnasium.registry)]
+    original = {known.lower(): known for known in (*_TASKS, *gymnasium.registry)}
+    near = [original[n] for n in difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.4)]
     hint = f"did you mean {' or '.join(near)}? " if near else ""
-    raise TaskError(f"unknown task {name!r}: {hint}known tasks: {', '.join(_TASKS)} (see: metrpo tasks)")
+    raise TaskError(
+        f"unknown task {name!r}: {hint}known tasks: {', '.join(_TASKS)} (see: metrpo tasks), any Gymnasium id, "
+        "module:name or path/to/file.py:name"
+    )
