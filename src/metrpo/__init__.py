@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from metrpo.run.metrics import read_metrics
     from metrpo.run.policy_file import LoadedPolicy, load_policy
     from metrpo.training import init, step, train
+    from metrpo.world.resolve import task_of
     from metrpo.world.task import Task, get_task, tasks
 
 __all__ = [
@@ -43,6 +44,7 @@ __all__ = [
     "read_metrics",
     "render",
     "step",
+    "task_of",
     "tasks",
     "train",
 ]
@@ -55,6 +57,7 @@ _HOME = {
     "metrpo.run.metrics": ("read_metrics",),
     "metrpo.run.policy_file": ("LoadedPolicy", "load_policy"),
     "metrpo.training": ("init", "step", "train"),
+    "metrpo.world.resolve": ("task_of",),
     "metrpo.world.task": ("Task", "get_task", "tasks"),
 }
 

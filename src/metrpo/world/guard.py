@@ -16,13 +16,13 @@ from metrpo.errors import MetrpoError, TaskError
 class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     """`env` with observations flattened to [S] float64 and actions in [-1, 1], rescaled to its own range.
 
-    Every call is checked, for a broken environment poisons the dataset in silence. Raises `TaskError`, naming the
-    environment, the call, what was expected and what was got, when it breaks its promise; and at once when its spaces
-    are of a kind that cannot be learned.
+    With `horizon` every episode is cut off (truncated) after so many steps. Every call is checked, for a broken
+    environment poisons the dataset in silence. Raises `TaskError`, naming the environment, the call, what was expected
+    and what was got, when it breaks its promise; and at once when its spaces are of a kind that cannot be learned.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any], name: str) -> None:
-        self._env, self._name = env, name
+    def __init__(self, env: gymnasium.Env[Any, Any], name: str, horizon: int | None = None) -> None:
+        self._env, self._name, self._horizon, self._steps = env, name, horizon, 0
         self.metadata, self.render_mode = env.metadata, env.render_mode
         actions = self._box(env.action_space, "action_space")
         if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
@@ -57,7 +57,7 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         result = self._call("reset", lambda: self._env.reset(seed=seed, options=options))
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._broken("reset()", "(observation, info)", result, "return both, as Gymnasium does since 0.26")
-        self._over = False
+        self._over, self._steps = False, 0
         return self._state(result[0], "reset()"), dict(result[1] or {})
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
@@ -77,12 +77,16 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         for flag, value in (("terminated", terminated), ("truncated", truncated)):
             if not isinstance(value, bool | np.bool_):
                 raise self._broken("step()", f"a bool as {flag}", value, f"return bool({flag})")
-        self._over = bool(terminated or truncated)
-        return state, float(np.asarray(reward).item()), bool(terminated), bool(truncated), dict(info or {})
+        self._steps += 1
+        truncated = bool(truncated) or self._steps == self._horizon
+        self._over = bool(terminated) or truncated
+        return state, float(np.asarray(reward).item()), bool(terminated), truncated, dict(info or {})
 
     @property
     def time_limit(self) -> int | None:
-        """Steps after which the environment truncates, as its wrappers or its registration say; None: unknown."""
+        """Steps after which an episode is cut off, by us, by a wrapper or by its registration; None: unknown."""
+        if self._horizon is not None:
+            return self._horizon
         env: Any = self._env
         while isinstance(env, gymnasium.Wrapper):
             if isinstance(env, gymnasium.wrappers.TimeLimit):

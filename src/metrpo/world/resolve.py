@@ -47,7 +47,7 @@ def task_of(
     try:
         state, _ = with_limit.reset(seed=0)
         with_limit.step(with_limit.action_space.sample())
-        actions, limit = with_limit.action_size, horizon or with_limit.time_limit
+        actions, limit = with_limit.action_size, with_limit.time_limit
     finally:
         with_limit.close()
     if limit is None:
@@ -66,9 +66,7 @@ def _make(env: str | MakeEnv, name: str, horizon: int | None, **kwargs: Any) -> 
         raise TaskError(f"{name}: cannot be made ({type(error).__name__}: {error})") from error
     if not isinstance(made, gymnasium.Env):
         raise TaskError(f"{name}: expected a gymnasium.Env, got {type(made).__name__}; return an instance, not a class")
-    if horizon is not None:
-        made = gymnasium.wrappers.TimeLimit(made, horizon)
-    return Guarded(made, name)
+    return Guarded(made, name, horizon)
 
 
 @cache
