@@ -18,10 +18,11 @@ from metrpo.config import CollectConfig, Config
 from metrpo.errors import TaskError
 from metrpo.model.imagine import SAMPLINGS, imagine, outcome, returns_per_model
 from metrpo.policy import gaussian
-from metrpo.presets import override
+from metrpo.presets import override, preset
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
 from metrpo.world import task as registry
+from metrpo.world.check import check_formulas
 from metrpo.world.guard import Guarded
 from metrpo.world.resolve import resolve, task_of
 from metrpo.world.task import get_task
@@ -252,6 +253,68 @@ def test_a_step_after_the_end_is_refused():
     guard.step(np.zeros(2, np.float32))
     with pytest.raises(TaskError, match="after the end of an episode"):
         guard.step(np.zeros(2, np.float32))
+
+
+# ---------------------------------------------------------------- formulas against the environment
+
+
+def pendulum(reward=None, terminated=None):
+    return task_of("Pendulum-v1", reward, terminated)
+
+
+def pendulum_reward(state, action, next_state):
+    """Of the angle before the step; the torque is at most 2."""
+    angle = np.arctan2(state[..., 1], state[..., 0])
+    return -(angle**2 + 0.1 * state[..., 2] ** 2 + 0.001 * (2 * action[..., 0]) ** 2)
+
+
+def test_a_right_formula_passes():
+    check_formulas(pendulum(pendulum_reward, lambda s: s[..., 0] > 2), np.random.default_rng(0))
+    check_formulas(task_of("InvertedPendulum-v5", None, lambda s: abs(s[..., 1]) > 0.2), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [
+        (
+            lambda: pendulum(lambda s, a, n: pendulum_reward(s, a / 2, n)),
+            r"of 1000 random transitions the largest difference is 0.00\d+ at number \d+, where the environment paid "
+            r"-[\d.]+ and the formula says .*s = \[.*a = \[.*s' = \[.*--trust-reward",
+        ),
+        (lambda: pendulum(lambda s, a, n: pendulum_reward(n, a, s)), "the reward's formula is not the environment's"),
+        (lambda: pendulum(lambda s, a, n: np.nan * s[..., 0]), "largest difference is inf"),
+        (lambda: pendulum(lambda s, a, n: s), r"expected shape \[1000\], got \[1000, 3\]; sum over the last axis"),
+        (lambda: pendulum(None, lambda s: s[..., 0] > 0.5), "did not end the episode, the formula says otherwise"),
+        (
+            lambda: task_of("InvertedPendulum-v5", None, lambda s: abs(s[..., 1]) > 0.3),
+            "the environment ended the episode, the formula says otherwise",
+        ),
+    ],
+)
+def test_a_wrong_formula_is_shown_where_it_is_wrong(task, message):
+    with pytest.raises(TaskError, match=message):
+        check_formulas(task(), np.random.default_rng(0))
+
+
+def test_training_checks_first_and_can_be_told_not_to(monkeypatch):
+    wrong = dataclasses.replace(pendulum(lambda s, a, n: 0 * s[..., 0]), name="Wrong")
+    monkeypatch.setitem(registry._TASKS, "Wrong", wrong)
+    config = Config(task="Wrong", evaluation_episodes=1)
+    with pytest.raises(TaskError, match="the reward's formula"):
+        training.train(config)
+    monkeypatch.setattr(training, "finished", lambda config, state: True)
+    assert training.train(dataclasses.replace(config, trust_reward=True)).iteration == 0
+    with pytest.raises(TaskError, match="the reward's formula"):
+        training.train(config)
+
+
+def test_the_generic_preset_follows_the_horizon():
+    config = preset("Pendulum-v1")
+    assert (config.iterations, config.collect.steps, config.validate.starts) == (10, 1000, 50)
+    config = preset("InvertedPendulum-v5", seed=3)
+    assert (config.collect.steps, config.validate.starts, config.seed) == (5000, 10, 3)
+    assert config.ensemble == preset("Swimmer").ensemble
+    assert preset("InvertedPendulum-v5", "paper").ensemble == preset("Swimmer", "paper").ensemble
 
 
 # ---------------------------------------------------------------- learned reward and learned end

@@ -91,6 +91,7 @@ OURS = {
     "fit.max_steps": (None, "an option of `fast`; the paper knows none, so it is off"),
     "system": ("me-trpo", "the label"),
     "method": ("model-based", "the paper's own"),
+    "trust_reward": (False, "the paper's tasks are our own"),
     **{
         f"{section}.{name}": (value, "used by the systems that the paper compares with, not by me-trpo")
         for section in ("gradient", "ppo", "svg")

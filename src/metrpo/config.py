@@ -314,6 +314,8 @@ class Config:
     improver: Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic"] = "trpo"
     """How the policy is improved in the ensemble: by the score function (trpo, ppo, vpg) or by backpropagation through
     the models, of the mean action or of reparametrised samples."""
+    trust_reward: bool = False
+    """Do not first hold the formulas of a task of your own against 1,000 (uncounted) real steps."""
     evaluation_episodes: int = 20
     """Real episodes of the deterministic policy that `return_real` averages; a report, never used to learn."""
     deterministic: bool = False
@@ -350,6 +352,7 @@ ADDED = (
     "config.gradient",
     "config.ppo",
     "config.svg",
+    "config.trust_reward",
 )
 """Settings newer than the first config.json files: where one is missing, its default is what was done then."""
 

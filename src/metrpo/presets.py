@@ -83,12 +83,25 @@ def preset(task: str, name: str = "fast", system: str = "me-trpo", **top_level: 
     if name not in ("fast", "paper"):
         raise ConfigError(f"preset: expected fast or paper, got {name!r}")
     row = SAME_AS.get(task, task)
-    overrides = PAPER.get(row, {}) if name == "paper" else FAST_ALL | FAST.get(row, {})
+    own = {} if row in PAPER else _generic(task)
+    overrides = (PAPER.get(row, {}) if name == "paper" else FAST_ALL | FAST.get(row, {})) | own
     if system not in SYSTEMS:
         raise ConfigError(f"system: expected one of {', '.join(SYSTEMS)}, got {system!r}")
     overrides = overrides | SYSTEMS[system] | (SYSTEMS_PAPER.get(system, {}) if name == "paper" else {})
     config = Config(task=task, preset=cast(Literal["fast", "paper"], name))
     return override(config, overrides | {"system": system} | top_level)
+
+
+def _generic(task: str) -> Overrides:
+    """For a task of the user's own: about five episodes an iteration, validated on about 10,000 steps of each model."""
+    from metrpo.world.task import get_task  # known only when a task is asked for that is not in these tables
+
+    horizon = get_task(task).horizon
+    return {
+        "iterations": 10,
+        "collect.steps": min(max(5 * horizon, 1000), 5000),
+        "validate.starts": min(max(10_000 // horizon, 10), 50),
+    }
 
 
 def override(config: Config, values: Overrides) -> Config:

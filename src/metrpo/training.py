@@ -19,6 +19,9 @@ from metrpo.algorithm import Row
 from metrpo.config import Config
 from metrpo.run.directory import RunDirectory, Saved
 from metrpo.run.progress import SILENT, Progress
+from metrpo.seeds import Stage, rng_of
+from metrpo.world.check import check_formulas
+from metrpo.world.task import get_task
 
 METHODS = {
     "model-based": "metrpo.algorithm",
@@ -47,13 +50,22 @@ def train(config: Config, run_dir: str | Path | None = None, progress: Progress 
 
     With `run_dir`, every iteration is saved there; a run found there is resumed, exactly as if it had never stopped.
 
-    Raises `TaskError` for an unknown task and `RunDirectoryError` when `run_dir` cannot be used (see `RunDirectory`).
+    The formulas of a task of the user's own are checked first (`metrpo.world.check`). Raises `TaskError` for an unknown
+    or broken task and `RunDirectoryError` when `run_dir` cannot be used (see `RunDirectory`).
     """
     template = init(config)
     if run_dir is None:
-        return _loop(config, template, progress, lambda state, row: row)
+        return _loop(config, _checked(config, template), progress, lambda state, row: row)
     with RunDirectory(run_dir, config) as run:
-        return _loop(config, run.load(template) or template, progress, run.save)
+        return _loop(config, run.load(template) or _checked(config, template), progress, run.save)
+
+
+def _checked(config: Config, first: Saved) -> Saved:
+    """The first state, once the formulas of a task that is not our own have been held against its environment."""
+    task = get_task(config.task)
+    if task.make is not None and not config.trust_reward:
+        check_formulas(task, rng_of(config.seed, 0, Stage.COLLECT))
+    return first
 
 
 def _loop(config: Config, state: Saved, progress: Progress, save: Callable[[Saved, Row], Mapping[str, Any]]) -> Saved:
