@@ -10,6 +10,7 @@ import dataclasses
 import json
 import logging
 import os
+import re
 import signal
 import sys
 from collections.abc import Callable, Sequence
@@ -54,7 +55,8 @@ def _train(command: Train) -> int:
 
     config = Config(**{f.name: getattr(command, f.name) for f in dataclasses.fields(Config)})
     system = "" if config.system == "me-trpo" else f"{config.system}-"
-    run_dir = command.run_dir or Path("runs") / f"{config.task}-{system}{config.preset}-seed{config.seed}"
+    task = re.sub(r"[^\w.-]+", "-", config.task)  # a task may be named path/to/file.py:name
+    run_dir = command.run_dir or Path("runs") / f"{task}-{system}{config.preset}-seed{config.seed}"
     signal.signal(signal.SIGTERM, _terminate)
     progress = default_progress()
     try:

@@ -25,11 +25,13 @@ class Train(Config):
         metrpo train Swimmer
         metrpo train HalfCheetah --seed 1 --real-steps 60000 --run-dir runs/cheetah
         metrpo train Swimmer --system ppo
+        metrpo train Pendulum-v1                          # any Gymnasium id; reward and end are learned
+        metrpo train path/to/file.py:task                 # a task or a function that makes an environment
         metrpo train Swimmer --preset paper --ensemble.members 10 --trpo.max-kl 0.02 --ensemble.hidden 512 512
     """
 
     task: Annotated[Positional[str], arg(metavar="TASK")] = "Swimmer"
-    """Name of the task (see: metrpo tasks)."""
+    """Name of the task (see: metrpo tasks), a Gymnasium id, module:name or path/to/file.py:name."""
     preset: Literal["fast", "paper"] = "fast"
     """What all other settings start from: the paper's values, or what learns soonest on two CPU cores."""
     system: System = "me-trpo"

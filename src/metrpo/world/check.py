@@ -46,8 +46,8 @@ def _check_rewards(task: Task, episodes: list[Episode]) -> None:
         at = int(np.argmax(off))
         raise TaskError(
             f"{task.name}: the reward's formula is not the environment's: of {len(paid)} random transitions the "
-            f"largest difference is {off[at]:.4g} at number {at}, where the environment paid {paid[at]:.6g} and the formula "
-            f"says {said[at]:.6g}; s = {_row(states[at])}, a = {_row(actions[at])} (in [-1, 1]), "
+            f"largest difference is {off[at]:.4g} at number {at}, where the environment paid {paid[at]:.6g} and the "
+            f"formula says {said[at]:.6g}; s = {_row(states[at])}, a = {_row(actions[at])} (in [-1, 1]), "
             f"s' = {_row(following[at])}. {_ADVICE}"
         )
 
