@@ -1,4 +1,4 @@
-"""The command line: `metrpo train | evaluate | render | tasks | doctor | bench | reproduce`.
+"""The command line: `metrpo train | evaluate | render | export | tasks | doctor | bench | reproduce`.
 
 Whatever imports JAX or MuJoCo is imported where it is used: help must come at once, and JAX reads its environment
 variables when imported.
@@ -19,7 +19,7 @@ from typing import Any
 
 from metrpo.config import Config
 from metrpo.errors import MetrpoError
-from metrpo.options import Bench, Doctor, Evaluate, Render, Reproduce, Tasks, Train, parse
+from metrpo.options import Bench, Doctor, Evaluate, Export, Render, Reproduce, Tasks, Train, parse
 
 
 class _Terminated(BaseException):
@@ -108,6 +108,13 @@ def _render(command: Render) -> int:
     return 0
 
 
+def _export(command: Export) -> int:
+    from metrpo.run.export import export
+
+    print(export(command.dir, command.out))
+    return 0
+
+
 def _tasks(command: Tasks) -> int:
     from metrpo.world.task import tasks
 
@@ -190,6 +197,7 @@ _COMMANDS: dict[type, Callable[[Any], int]] = {
     Train: _train,
     Evaluate: _evaluate,
     Render: _render,
+    Export: _export,
     Tasks: _tasks,
     Doctor: _doctor,
     Bench: _bench,

@@ -85,6 +85,22 @@ class Render:
 
 
 @dataclass(frozen=True)
+class Export:
+    """Write a run's policy as one file that needs no metrpo: Python with NumPy alone, or ONNX.
+
+    For example:
+        metrpo export runs/Swimmer-fast-seed0
+        metrpo export runs/Swimmer-fast-seed0 --out swim.py && python swim.py
+        metrpo export runs/Swimmer-fast-seed0 --out swim.onnx
+    """
+
+    dir: Annotated[Positional[Path], arg(metavar="DIR")]
+    """The run directory."""
+    out: Annotated[Path | None, arg(metavar="FILE")] = None
+    """File to write, .py, .onnx or .npz; default: policy.py in the run directory."""
+
+
+@dataclass(frozen=True)
 class Tasks:
     """List the tasks that can be learnt.
 
@@ -169,7 +185,7 @@ class Reproduce:
                 raise ConfigError(f"{name}: expected at least 1, got {value}")
 
 
-Command = Train | Evaluate | Render | Tasks | Doctor | Bench | Reproduce
+Command = Train | Evaluate | Render | Export | Tasks | Doctor | Bench | Reproduce
 
 _DESCRIPTION = """Model-Ensemble Trust-Region Policy Optimization: control learnt from few real steps.
 
@@ -211,6 +227,7 @@ def _with_defaults(train: Train, arguments: list[str], quiet: bool = False) -> C
         Annotated[Train, subcommand("train", default=train)]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Render, subcommand("render")]
+        | Annotated[Export, subcommand("export")]
         | Annotated[Tasks, subcommand("tasks")]
         | Annotated[Doctor, subcommand("doctor")]
         | Annotated[Bench, subcommand("bench")]

@@ -1,0 +1,344 @@
+"""An exported policy acts as the trained one, wherever it runs, and runs nothing but its own few lines."""
+
+import ast
+import dataclasses
+import json
+import re
+import runpy
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from metrpo.errors import MetrpoError, RunDirectoryError
+from metrpo.policy import gaussian
+from metrpo.run.export import export
+from metrpo.run.files import read_arrays, write_arrays
+from metrpo.run.policy_file import PolicyInfo, load_policy, save_policy
+
+S, A = 11, 3
+HOSTILE = [
+    '"""\nimport os\nos.abort()\n"""',
+    "'''\nraise SystemExit(3)\n'''",
+    '\\"""\nimport os\n',
+    "\\",
+    '"',
+    "$weights ${sha256} $$ {0} {TASK} %s",
+    "../../etc/passwd",
+    "dm_control/walker-walk:v0",
+    "\r\n\x00\x1b[2J\u2028 # coding: rot13",
+    "\ud800 \udcff ü 机器人 🦿",
+    "",
+]
+
+
+def saved(directory, hidden=(8,), scale=1.0, task="Swimmer"):
+    policy = gaussian.init(jax.random.key(1), S, A, hidden, 1.0)
+    policy = policy._replace(layers=tuple((scale * w, b + 0.1) for w, b in policy.layers))
+    save_policy(directory, policy, task, 3, 900, 12.5)
+    return policy
+
+
+def python(path):
+    return SimpleNamespace(**runpy.run_path(str(path), run_name="policy"))
+
+
+def onnx(path):
+    runtime = pytest.importorskip("onnxruntime")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    return lambda observations: session.run(["action"], {"observation": observations.astype(np.float32)})[0]
+
+
+def needs_onnx(ending):
+    if ending == ".onnx":
+        pytest.importorskip("onnx")
+        pytest.importorskip("onnxruntime")
+
+
+READERS = {".py": lambda path: python(path).act, ".onnx": onnx, ".npz": load_policy}
+
+
+@pytest.mark.parametrize("hidden", [(), (8,), (32, 32), (100, 50, 25)])
+@pytest.mark.parametrize("ending", READERS)
+def test_every_form_is_the_clipped_mean_of_the_trained_policy(ending, hidden, tmp_path):
+    needs_onnx(ending)
+    policy = saved(tmp_path, hidden)
+    act = READERS[ending](export(tmp_path, tmp_path / f"exported{ending}"))
+    rng = np.random.default_rng(0)
+    # With one huge number in each, float32 sums do not cancel, so that every order of summation gives the same.
+    huge = rng.standard_normal((2 * S, S)) + 1e6 * np.concatenate([np.eye(S), -np.eye(S)])
+    batches = [rng.standard_normal((1000, S)), huge, rng.standard_normal((1, S)), np.zeros((1, S)), np.zeros((0, S))]
+    ends = np.cumsum([len(observations) for observations in batches[:-1]])
+    together = jnp.asarray(np.concatenate(batches), jnp.float32)
+    expected = np.clip(gaussian.mean(policy, together), -1, 1)
+    for observations, wanted in zip(batches, np.split(expected, ends), strict=True):
+        actions = act(observations)
+        assert (actions.dtype, actions.shape) == (np.float32, (len(observations), A))
+        np.testing.assert_allclose(actions, wanted, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("ending", READERS)
+def test_actions_are_clipped(ending, tmp_path):
+    needs_onnx(ending)
+    saved(tmp_path, scale=50.0)
+    act = READERS[ending](export(tmp_path, tmp_path / f"exported{ending}"))
+    actions = act(np.random.default_rng(0).standard_normal((50, S)))
+    assert (actions.min(), actions.max()) == (-1, 1)
+
+
+def test_python_takes_single_observations_and_says_which_shapes_it_takes(tmp_path):
+    saved(tmp_path)
+    act = python(export(tmp_path)).act
+    observations = np.random.default_rng(0).standard_normal((5, S))
+    singles = [act(list(observation)) for observation in observations]
+    assert {(one.dtype, one.shape) for one in singles} == {(np.dtype(np.float32), (A,))}
+    np.testing.assert_allclose(singles, act(observations), rtol=0, atol=1e-6)
+    for shape in [(), (S + 1,), (4, S + 1), (2, 3, S), (S, 1)]:
+        with pytest.raises(ValueError, match=r"expected shape \[11\] or \[B, 11\], got " + re.escape(str(list(shape)))):
+            act(np.zeros(shape))
+
+
+def test_python_describes_itself(tmp_path):
+    saved(tmp_path)
+    path = export(tmp_path)
+    assert path == tmp_path / "policy.py"
+    module = python(path)
+    assert (module.OBSERVATION_SIZE, module.ACTION_SIZE, module.TASK) == (S, A, "Swimmer")
+    beside = json.loads((tmp_path / "policy.json").read_text())
+    origin = {"metrpo": beside["metrpo"], "policy_sha256": beside["sha256"]}
+    assert {**dataclasses.asdict(load_policy(tmp_path).info), "hidden": [8], **origin} == module.INFO
+    for fact in ("from policy import act", "S = 11, A = 3", "environment: Swimmer.", *origin.values(), "3 iterations"):
+        assert fact in module.__doc__
+    assert str(tmp_path) not in path.read_text()
+
+
+def test_python_is_short_plain_and_the_same_every_time(tmp_path):
+    saved(tmp_path, (100, 50, 25))
+    source = export(tmp_path).read_bytes()
+    assert source.isascii()
+    assert max(map(len, source.splitlines())) <= 120
+    tree = ast.parse(source, feature_version=(3, 8))
+    imports = [alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names]
+    assert imports == ["base64", "hashlib", "numpy"]
+    assert not any(isinstance(node, ast.ImportFrom) for node in ast.walk(tree))
+    names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    assert names.isdisjoint({"exec", "eval", "compile", "open", "__import__", "getattr", "globals"})
+    assert export(tmp_path, tmp_path / "again.py").read_bytes() == source
+
+
+def test_python_runs_without_jax_and_metrpo_in_another_directory(tmp_path):
+    saved(tmp_path / "run", (32, 32))
+    export(tmp_path / "run", tmp_path / "elsewhere" / "swim.py")
+    code = (
+        "import sys; sys.modules['jax'] = sys.modules['metrpo'] = None; sys.path.insert(0, '.')\n"
+        "import swim; print(swim.act([0.5] * 11).tolist(), set(sys.modules) & {'jaxlib', 'scipy', 'onnx', 'pickle'})"
+    )
+    command = [sys.executable, "-I", "-B", "-W", "error"]
+    run = {"cwd": tmp_path / "elsewhere", "capture_output": True, "text": True, "check": True}
+    expected = load_policy(tmp_path / "run")(np.full(S, 0.5)).tolist()
+    used = subprocess.run([*command, "-c", code], **run).stdout
+    np.testing.assert_allclose(json.loads(used[: used.index("]") + 1]), expected, atol=1e-6)
+    assert not re.search("jaxlib|scipy|onnx", used)
+    checked = subprocess.run([*command, "swim.py"], **run).stdout
+    assert checked == "ok: 'Swimmer', observations of 11 numbers, actions of 3\n"
+
+
+def test_the_self_check_fails_when_the_action_differs(tmp_path):
+    saved(tmp_path)
+    source = export(tmp_path).read_text()
+    (tmp_path / "other.py").write_text(source.replace("np.tanh(", "np.sin("))
+    ran = subprocess.run([sys.executable, "-I", tmp_path / "other.py"], capture_output=True, text=True)
+    assert ran.returncode == 1
+    assert "expected the action [" in ran.stderr
+
+
+@pytest.mark.parametrize("position", [0, 1000, -2])
+@pytest.mark.parametrize("byte", ["flipped", "*", "\n", ""])
+def test_damaged_weights_are_refused_at_import(position, byte, tmp_path):
+    saved(tmp_path, (32, 32))
+    source = export(tmp_path).read_text()
+    start = source.index('_layers("""\n') + len('_layers("""\n')
+    end = source.index('"""', start)
+    at = (start if position >= 0 else end) + position
+    flipped = chr(ord(source[at]) ^ 1) if source[at].isalpha() else "A"
+    damaged = source[:at] + (flipped if byte == "flipped" else byte) + source[at + 1 :]
+    (tmp_path / "damaged.py").write_text(damaged)
+    with pytest.raises(ImportError, match=r"embedded weights are damaged: expected SHA-256 [0-9a-f]{64}, got"):
+        python(tmp_path / "damaged.py")
+
+
+def skeleton(source):
+    """The program without what its literals say."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Constant):
+            node.value = type(node.value).__name__
+    return ast.dump(tree)
+
+
+def listed(names):
+    def decorate(test):
+        for name in names:
+            test = example(name)(test)
+        return test
+
+    return decorate
+
+
+@pytest.fixture(scope="module")
+def ordinary(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("ordinary")
+    saved(directory)
+    return export(directory)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.text(st.characters(exclude_categories=()) | st.sampled_from("'\"\\\n\r{}$#"), max_size=40))
+@listed(HOSTILE)
+def test_no_name_of_a_task_becomes_code(ordinary, name):
+    with tempfile.TemporaryDirectory() as place:
+        rename(ordinary.with_name("policy.npz"), Path(place), task=name)
+        path = export(Path(place))
+        assert sorted(entry.name for entry in Path(place).iterdir()) == ["policy.npz", "policy.py"]
+        assert path.read_bytes().isascii()
+        assert skeleton(path.read_bytes()) == skeleton(ordinary.read_bytes())
+        module = python(path)
+        # JSON joins two halves of a character, which Python would keep apart.
+        assert module.TASK == module.INFO["task"] == json.loads(json.dumps(name))
+        assert f"environment: {module.TASK}.\n" in module.__doc__
+
+
+def rename(source, directory, **fields):
+    arrays, meta = read_arrays(source)
+    write_arrays(directory / "policy.npz", arrays, {"policy": meta["policy"] | fields})
+
+
+@pytest.mark.parametrize("name", [f.name for f in dataclasses.fields(PolicyInfo)])
+def test_no_other_field_becomes_code_either(ordinary, name, tmp_path):
+    rename(
+        ordinary.with_name("policy.npz"),
+        tmp_path,
+        **{name: ['0"""\nimport os'] if name == "hidden" else '0"""\nimport os\nos.abort()\n"""'},
+    )
+    if name in ("observation_size", "action_size", "hidden", "activation"):
+        with pytest.raises(RunDirectoryError, match=r"policy\.npz: "):
+            export(tmp_path)
+    else:
+        module = python(export(tmp_path))
+        assert "os.abort()" in module.INFO[name]
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), None])
+def test_a_return_that_is_no_number_is_none(ordinary, value, tmp_path):
+    rename(ordinary.with_name("policy.npz"), tmp_path, return_real=value)
+    assert python(export(tmp_path)).INFO["return_real"] is None
+
+
+def test_onnx_is_valid_and_describes_itself(tmp_path):
+    package = pytest.importorskip("onnx")
+    saved(tmp_path, (32, 32))
+    model = package.load(export(tmp_path, tmp_path / "policy.onnx"))
+    package.checker.check_model(model, full_check=True)
+    ends = [(*model.graph.input, "observation", S), (*model.graph.output, "action", A)]
+    for end, name, size in ends:
+        batch, numbers = end.type.tensor_type.shape.dim
+        assert (end.name, batch.dim_param, numbers.dim_value) == (name, "batch", size)
+        assert end.type.tensor_type.elem_type == package.TensorProto.FLOAT
+        assert end.doc_string
+    beside = json.loads((tmp_path / "policy.json").read_text())
+    facts = {entry.key: entry.value for entry in model.metadata_props}
+    expected = {"task": "Swimmer", "observation_size": "11", "action_size": "3", "hidden": "[32, 32]"}
+    assert expected.items() | {("metrpo", beside["metrpo"]), ("policy_sha256", beside["sha256"])} <= facts.items()
+    assert (model.producer_name, model.producer_version) == ("metrpo", beside["metrpo"])
+    assert "Swimmer" in model.doc_string
+    assert model.opset_import[0].version == 13
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_onnx_holds_any_name(name, tmp_path):
+    package = pytest.importorskip("onnx")
+    saved(tmp_path, task=name)
+    path = export(tmp_path, tmp_path / "policy.onnx")
+    package.checker.check_model(package.load(path))
+    onnx(path)(np.zeros((1, S)))
+
+
+def test_onnx_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    saved(tmp_path)
+    with pytest.raises(MetrpoError, match=r"no package onnx: pip install 'metrpo\[export\]'"):
+        export(tmp_path, tmp_path / "policy.onnx")
+    assert not (tmp_path / "policy.onnx").exists()
+
+
+def test_npz_is_a_copy(tmp_path):
+    saved(tmp_path)
+    copy = export(tmp_path, tmp_path / "there" / "swim.npz")
+    assert copy.read_bytes() == (tmp_path / "policy.npz").read_bytes()
+    assert export(copy) == tmp_path / "there" / "policy.py"
+
+
+@pytest.mark.parametrize(
+    ("name", "got"), [("policy.pt", r"\.pt"), ("policy", "no ending"), ("policy.py.txt", r"\.txt")]
+)
+def test_other_endings_say_what_was_expected(name, got, tmp_path):
+    saved(tmp_path)
+    with pytest.raises(MetrpoError, match=rf"expected a name that ends in \.py, \.onnx, \.npz; got {got}"):
+        export(tmp_path, tmp_path / name)
+
+
+@pytest.mark.parametrize("ending", [".py", ".npz"])
+def test_what_is_no_policy_leaves_the_old_file(ending, tmp_path):
+    out = tmp_path / f"out{ending}"
+    out.write_text("old")
+    with pytest.raises(RunDirectoryError, match="holds no policy"):
+        export(tmp_path, out)
+    saved(tmp_path)
+    content = (tmp_path / "policy.npz").read_bytes()
+    (tmp_path / "policy.npz").write_bytes(content[:-100] + b"!" + content[-99:])
+    with pytest.raises(RunDirectoryError, match="is damaged"):
+        export(tmp_path, out)
+    assert out.read_text() == "old"
+
+
+@pytest.mark.parametrize(
+    ("array", "value", "message"),
+    [
+        ("w0", np.zeros((S, 9), np.float32), "expected weights and biases of shapes .* got .*9"),
+        ("b0", np.full(8, np.nan, np.float32), "expected finite weights"),
+    ],
+)
+def test_a_policy_that_cannot_act_is_refused(array, value, message, tmp_path):
+    saved(tmp_path)
+    arrays, meta = read_arrays(tmp_path / "policy.npz")
+    write_arrays(tmp_path / "policy.npz", arrays | {array: value}, {"policy": meta["policy"]})
+    with pytest.raises(RunDirectoryError, match=message):
+        export(tmp_path)
+
+
+def test_a_directory_in_the_way_is_named(tmp_path):
+    saved(tmp_path)
+    (tmp_path / "policy.py").mkdir()
+    with pytest.raises(RunDirectoryError, match=r"cannot write .*policy\.py"):
+        export(tmp_path)
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_somebody_elses_script_is_not_overwritten(tmp_path):
+    saved(tmp_path)
+    mine = tmp_path / "train.py"
+    mine.write_text("print('mine')\n")
+    with pytest.raises(MetrpoError, match="exists and is no exported policy"):
+        export(tmp_path, mine)
+    assert mine.read_text() == "print('mine')\n"
+    assert export(tmp_path, tmp_path / "policy.py") == export(tmp_path), "an older export is"
