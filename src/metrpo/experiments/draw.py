@@ -96,11 +96,13 @@ def _draw_wall_clock(picture: Picture, figure: Figure, curves: list[Curves]) -> 
     for i, c in enumerate(curves):
         ours = [seconds[-1] / steps[-1] * 1000 for steps, seconds in c.column("wall_seconds")]
         theirs = PAPER_SECONDS[c.task] / PAPER_REAL_STEPS[c.task] * 1000
-        axes.bar(i - 0.2, float(np.mean(ours)), 0.38, color=_REAL, label="these runs" if not i else None)
-        axes.bar(i + 0.2, theirs, 0.38, color="#b9bec6", label="paper (1 K80, 4 virtual CPUs)" if not i else None)
-        axes.plot([i - 0.2] * len(ours), ours, "k.", markersize=5)
-        for x, value in ((i - 0.2, float(np.mean(ours))), (i + 0.2, theirs)):
-            axes.annotate(f"{value:.3g}", (x, value), ha="center", va="bottom", fontsize=8)
+        for values, colour, label in (
+            (ours, _REAL, "these runs"),
+            ([theirs], "#8a8f98", "paper (1 K80, 4 virtual CPUs)"),
+        ):
+            axes.plot([i] * len(values), values, "o", color=colour, label=None if i else label)
+            note = f"{float(np.mean(values)):.3g}"
+            axes.annotate(note, (i, values[0]), xytext=(8, -3), textcoords="offset points", fontsize=9)
     axes.set_xticks(range(len(curves)), [c.task for c in curves])
     axes.set_yscale("log")
     axes.set_ylabel("seconds per 1,000 real steps")

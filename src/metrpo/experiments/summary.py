@@ -68,8 +68,8 @@ def summarise(figure: str, runs: Sequence[Run], out: Path) -> list[dict[str, Any
     `at_common`: the return there, `average`: the mean return up to there (how soon it learns), both of every seed and
     with the interquartile mean and its 95 % interval. `first_better`: the probability that a seed of the figure's first
     system has the higher return (average) there. `level`: 95 % of the way from the first system's first measurement to
-    its last, means over its seeds; `steps`: real steps to that level, mean over the seeds (NaN when one never reaches
-    it); `ratio`: how many times the first system's own.
+    its last, means over its seeds; `steps`: real steps after which the mean over the seeds reaches that level (NaN:
+    never); `ratio`: how many times the first system's own. What had not been measured by the common steps is NaN.
     """
     records = []
     everything = curves_of(figure, runs, out)
@@ -133,15 +133,15 @@ def _cells(r: dict[str, Any]) -> tuple[str, ...]:
         r["system"],
         f"{r['real_steps']:,}",
         f"{np.mean(r['last']):.1f} ({', '.join(f'{x:.1f}' for x in r['last'])})",
-        f"{_interval(r['at_common_iqm'])} at {r['common_steps']:,}",
-        _interval(r["average_iqm"]),
-        ", ".join(f"{p:.2f}" for p in r.get("first_better", [])),
+        f"{_interval(r['at_common_iqm'])} ({r['common_steps']:,})",
+        _interval(r["average_iqm"] if np.isfinite(r["at_common_iqm"][0]) else r["at_common_iqm"]),
+        ", ".join("-" if np.isnan(p) else f"{p:.2f}" for p in r.get("first_better", [])),
         reached,
     )
 
 
 def _interval(iqm_low_high: Sequence[float]) -> str:
-    return "{:.1f} [{:.1f}, {:.1f}]".format(*iqm_low_high)
+    return "{:.1f} [{:.1f}, {:.1f}]".format(*iqm_low_high) if np.isfinite(iqm_low_high[0]) else "not measured yet"
 
 
 def _iqm(scores: np.ndarray) -> list[float]:
@@ -150,9 +150,9 @@ def _iqm(scores: np.ndarray) -> list[float]:
 
 
 def _average(curves: Curves, common: float) -> np.ndarray:
-    """Mean return between a seed's first measurement and the common steps, for every seed."""
-    seeds = curves.column("return_real")
-    return np.array([at_steps([seed], np.linspace(seed[0][0], max(common, seed[0][0]), GRID)).mean() for seed in seeds])
+    """Mean return from a seed's first measurement to the common steps, for every seed; NaN when that comes later."""
+    # Of a grid that runs backwards, the points before the first measurement are NaN.
+    return np.array([at_steps([s], np.linspace(s[0][0], common, GRID)).mean() for s in curves.column("return_real")])
 
 
 def _level(curves: Curves) -> float:
@@ -165,8 +165,12 @@ def _at(curves: Curves, steps: float) -> np.ndarray:
 
 
 def _steps_to(curves: Curves, level: float) -> float:
-    """Mean over the seeds; NaN when one of them never reaches it."""
-    return float(np.mean([steps_to_reach(steps, returns, level) for steps, returns in curves.column("return_real")]))
+    """When the mean over the seeds reaches the level; NaN if never."""
+    seeds = curves.column("return_real")
+    first, last = max(steps[0] for steps, _ in seeds), min(steps[-1] for steps, _ in seeds)
+    grid = np.unique(np.concatenate([steps for steps, _ in seeds]))
+    grid = grid[(grid >= first) & (grid <= last)]
+    return steps_to_reach(grid, at_steps(seeds, grid).mean(axis=0), level)
 
 
 def _values(rows: Sequence[Row], name: str) -> np.ndarray:
