@@ -20,7 +20,7 @@ from metrpo.config import Config
 from metrpo.policy.gaussian import Policy
 from metrpo.presets import override
 from metrpo.run.progress import Progress
-from metrpo.world import task as registry
+from metrpo.world import registry
 
 BASE = override(
     Config(task="Probe", evaluation_episodes=10),

@@ -140,7 +140,16 @@ IMPOSSIBLE = {
     "validate.starts": [0],
 }
 FREE = {"preset", "improver", "deterministic", "collect.std_per", "fit.loss_units", "imagine.sampling", "imagine.start"}
-FREE |= {"validate.rule", "fit.products", "imagine.products", "system", "method", "svg.horizon", "trust_reward"}
+FREE |= {
+    "validate.rule",
+    "fit.products",
+    "imagine.products",
+    "system",
+    "method",
+    "svg.horizon",
+    "trust_reward",
+    "learn_reward",
+}
 
 
 def test_every_number_has_its_impossible_values_listed_here():

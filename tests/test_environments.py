@@ -13,7 +13,7 @@ from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 import probe
 from helpers import linear_ensemble, random_ensemble, random_episode
-from metrpo import training
+from metrpo import algorithm, training
 from metrpo.config import CollectConfig, Config
 from metrpo.errors import TaskError
 from metrpo.model.imagine import SAMPLINGS, imagine, outcome, returns_per_model
@@ -21,11 +21,11 @@ from metrpo.policy import gaussian
 from metrpo.presets import override, preset
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
-from metrpo.world import task as registry
+from metrpo.world import registry
 from metrpo.world.check import check_formulas
 from metrpo.world.guard import Guarded
+from metrpo.world.registry import get_task
 from metrpo.world.resolve import resolve, task_of
-from metrpo.world.task import get_task
 
 
 class Env(gymnasium.Env):
@@ -306,6 +306,33 @@ def test_training_checks_first_and_can_be_told_not_to(monkeypatch):
     assert training.train(dataclasses.replace(config, trust_reward=True)).iteration == 0
     with pytest.raises(TaskError, match="the reward's formula"):
         training.train(config)
+
+
+@pytest.mark.parametrize(
+    ("name", "sizes", "learned"),
+    [
+        ("Pendulum-v1", (3, 1, 200), ()),
+        ("InvertedPendulum-v5", (4, 1, 1000), ()),
+        ("mbbl/CartPole", (4, 1, 200), ()),
+        ("HalfCheetah-v5", (18, 6, 1000), ()),
+    ],
+)
+def test_tasks_with_known_formulas_use_them_unless_told_to_learn(name, sizes, learned):
+    task = get_task(name)
+    assert (task.state_size, task.action_size, task.horizon) == sizes
+    assert task.learned == learned
+    assert callable(task.terminated) == (name == "InvertedPendulum-v5")
+    blind = algorithm.task_of(Config(task=name, learn_reward=True))
+    assert blind.learned == ("reward", "end")
+    assert blind is algorithm.task_of(Config(task=name, learn_reward=True)), "another object would be compiled anew"
+    assert algorithm.task_of(Config(task=name)) is task
+
+
+def test_the_first_state_has_outputs_for_what_is_learned():
+    for learn, outputs in ((False, 3), (True, 5)):
+        config = override(Config(task="Pendulum-v1", learn_reward=learn), {"ensemble.hidden": (4,)})
+        state = algorithm.init(config)
+        assert state.networks[-1][0].shape[-1] == state.dataset.train.deltas.shape[1] == outputs
 
 
 def test_the_generic_preset_follows_the_horizon():

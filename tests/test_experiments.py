@@ -26,7 +26,7 @@ from metrpo.presets import preset
 from metrpo.run import machine
 from metrpo.run.metrics import read_metrics, to_csv
 from metrpo.systems import SYSTEMS
-from metrpo.world.task import tasks
+from metrpo.world.registry import tasks
 
 RUN = Run("Swimmer", "k-1", 0, (("iterations", 3),), "fast")
 

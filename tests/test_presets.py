@@ -12,7 +12,7 @@ from metrpo.config import Config, System, flatten, from_json, to_json
 from metrpo.errors import ConfigError
 from metrpo.presets import preset
 from metrpo.systems import SYSTEMS
-from metrpo.world.task import tasks
+from metrpo.world.registry import tasks
 
 TASKS = ["Swimmer", "Snake", "Hopper", "HopperUpright", "HalfCheetah", "Ant", "Humanoid", "HumanoidStandup"]
 
@@ -92,6 +92,7 @@ OURS = {
     "system": ("me-trpo", "the label"),
     "method": ("model-based", "the paper's own"),
     "trust_reward": (False, "the paper's tasks are our own"),
+    "learn_reward": (False, "section 2: the reward function is known"),
     **{
         f"{section}.{name}": (value, "used by the systems that the paper compares with, not by me-trpo")
         for section in ("gradient", "ppo", "svg")

@@ -106,7 +106,7 @@ import sys
 from pathlib import Path
 import numpy as np
 from metrpo.run.video import record
-from metrpo.world.task import get_task
+from metrpo.world.registry import get_task
 task = get_task("Swimmer")
 def short(**kwargs):
     env = task.make_env(**kwargs)

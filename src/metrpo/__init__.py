@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from metrpo.run.metrics import read_metrics
     from metrpo.run.policy_file import LoadedPolicy, load_policy
     from metrpo.training import init, step, train
+    from metrpo.world.registry import get_task, tasks
     from metrpo.world.resolve import task_of
-    from metrpo.world.task import Task, get_task, tasks
+    from metrpo.world.task import Task
 
 __all__ = [
     "Config",
@@ -58,7 +59,8 @@ _HOME = {
     "metrpo.run.policy_file": ("LoadedPolicy", "load_policy"),
     "metrpo.training": ("init", "step", "train"),
     "metrpo.world.resolve": ("task_of",),
-    "metrpo.world.task": ("Task", "get_task", "tasks"),
+    "metrpo.world.registry": ("get_task", "tasks"),
+    "metrpo.world.task": ("Task",),
 }
 
 

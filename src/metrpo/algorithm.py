@@ -36,7 +36,8 @@ from metrpo.types import Array
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
 from metrpo.world.dataset import Dataset
-from metrpo.world.task import Task, get_task
+from metrpo.world.registry import get_task, without_formulas
+from metrpo.world.task import Task
 
 Row = dict[str, float | int]
 """One iteration's metrics, in the order of metrics.csv's columns."""
@@ -60,7 +61,7 @@ class State(NamedTuple):
 
 def init(config: Config) -> State:
     """The state before the first iteration."""
-    task = get_task(config.task)
+    task = task_of(config)
     policy_key, ensemble_key = jax.random.split(key_of(config.seed, 0, Stage.INIT))
     policy = gaussian.init(
         policy_key, task.state_size, task.action_size, config.policy.hidden, config.policy.initial_std
@@ -78,7 +79,7 @@ def init(config: Config) -> State:
 
 def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
     """One outer iteration: collect, fit, improve until the ensemble disagrees; and evaluate, for the record only."""
-    task = get_task(config.task)
+    task = task_of(config)
     iteration = state.iteration + 1
     clock = Clock()
     with clock("collect"):
@@ -154,6 +155,12 @@ def _improve(
         lambda updates, accepted, value: progress.update(updates, f"accepted {accepted}, imagined return {value:.2f}"),
         lambda policy: float(np.mean(evaluate(config, task, policy, iteration))),
     )
+
+
+def task_of(config: Config) -> Task:
+    """The config's task, its formulas left out where they are to be learned."""
+    task = get_task(config.task)
+    return without_formulas(task) if config.learn_reward else task
 
 
 def evaluate(config: Config, task: Task, policy: Policy, iteration: int) -> np.ndarray:

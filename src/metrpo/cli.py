@@ -116,7 +116,8 @@ def _export(command: Export) -> int:
 
 
 def _tasks(command: Tasks) -> int:
-    from metrpo.world.task import tasks
+    from metrpo.world.known import KNOWN
+    from metrpo.world.registry import tasks
 
     columns = ("name", "env_id", "state_size", "action_size", "horizon", "description")
     rows = [{column: getattr(task, column) for column in columns} for task in tasks().values()]
@@ -126,6 +127,8 @@ def _tasks(command: Tasks) -> int:
     print(f"{'task':<17} {'states':>6} {'actions':>7} {'steps':>5}  description")
     for row in rows:
         print("{name:<17} {state_size:>6} {action_size:>7} {horizon:>5}  {description}".format(**row))
+    print(f"\nalso with their formulas: {', '.join(KNOWN)}")
+    print("and with a learned reward: any other Gymnasium id, module:name, path/to/file.py:name")
     return 0
 
 

@@ -314,6 +314,8 @@ class Config:
     improver: Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic"] = "trpo"
     """How the policy is improved in the ensemble: by the score function (trpo, ppo, vpg) or by backpropagation through
     the models, of the mean action or of reparametrised samples."""
+    learn_reward: bool = False
+    """Learn the reward and the end of episodes even where the task has formulas for them."""
     trust_reward: bool = False
     """Do not first hold the formulas of a task of your own against 1,000 (uncounted) real steps."""
     evaluation_episodes: int = 20
@@ -352,6 +354,7 @@ ADDED = (
     "config.gradient",
     "config.ppo",
     "config.svg",
+    "config.learn_reward",
     "config.trust_reward",
 )
 """Settings newer than the first config.json files: where one is missing, its default is what was done then."""

@@ -13,7 +13,7 @@ from metrpo.errors import ConfigError
 from metrpo.run.policy_file import LoadedPolicy, load_policy
 from metrpo.run.video import record
 from metrpo.world import collect
-from metrpo.world.task import get_task
+from metrpo.world.registry import get_task
 
 
 @dataclass(frozen=True)

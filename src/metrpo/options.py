@@ -211,7 +211,7 @@ def parse(arguments: list[str]) -> Command:
     from metrpo.run import machine
 
     machine.prepare(first.device, first.deterministic)
-    from metrpo.world.task import get_task
+    from metrpo.world.registry import get_task
 
     task = get_task(first.task).name
     parsed = _with_defaults(_defaults(preset(task, first.preset, first.system)), arguments)

@@ -94,7 +94,7 @@ def preset(task: str, name: str = "fast", system: str = "me-trpo", **top_level: 
 
 def _generic(task: str) -> Overrides:
     """For a task of the user's own: about five episodes an iteration, validated on about 10,000 steps of each model."""
-    from metrpo.world.task import get_task  # known only when a task is asked for that is not in these tables
+    from metrpo.world.registry import get_task  # known only when a task is asked for that is not in these tables
 
     horizon = get_task(task).horizon
     return {

@@ -23,7 +23,7 @@ from metrpo.run.clock import Clock
 from metrpo.run.progress import SILENT, Progress
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.types import Array, Trajectories
-from metrpo.world.task import get_task
+from metrpo.world.registry import get_task
 
 _EPISODES = 64
 """Batches are padded to a multiple of so many episodes: where these end early their number changes all the time."""

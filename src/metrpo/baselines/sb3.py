@@ -23,7 +23,7 @@ from metrpo.policy.gaussian import Policy
 from metrpo.run.clock import Clock
 from metrpo.run.progress import SILENT, Progress
 from metrpo.seeds import Stage, rng_of
-from metrpo.world.task import get_task
+from metrpo.world.registry import get_task
 
 try:
     import torch

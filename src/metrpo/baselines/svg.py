@@ -32,7 +32,8 @@ from metrpo.run.progress import SILENT, Progress
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.types import Array, Episode, Normaliser, Transitions
 from metrpo.world import dataset as datasets
-from metrpo.world.task import Task, get_task
+from metrpo.world.registry import get_task
+from metrpo.world.task import Task
 
 _VALUE_HIDDEN = (64, 64)
 

@@ -28,7 +28,8 @@ from metrpo.policy.gaussian import Policy
 from metrpo.presets import override, preset
 from metrpo.types import Array, Trajectories, Transitions
 from metrpo.world import collect as real
-from metrpo.world.task import Task, get_task
+from metrpo.world.registry import get_task
+from metrpo.world.task import Task
 
 TASK = "HalfCheetah"
 STATE, ACTION, MEMBERS, BATCH = 18, 6, 5, 1000

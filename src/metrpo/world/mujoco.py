@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from metrpo.errors import TaskError
 from metrpo.types import Array
-from metrpo.world.task import Task, get_task, register
+from metrpo.world.registry import get_task, register
+from metrpo.world.task import Task
 
 _Reward = Callable[[Array, Array, Array], Array]
 _StateOf = Callable[[mujoco.MjModel, mujoco.MjData], NDArray[np.float64]]

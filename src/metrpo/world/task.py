@@ -1,15 +1,13 @@
-"""A task: an environment, its reward and termination as formulas, and its horizon; and the registry of tasks."""
+"""A task: an environment, its reward and termination as formulas, and its horizon."""
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import gymnasium
 
-from metrpo.errors import TaskError
 from metrpo.types import Array
 
 
@@ -47,40 +45,3 @@ class Task:
     def make_env(self, **kwargs: Any) -> gymnasium.Env:
         """A fresh environment with the time limit of the task (`kwargs` such as `render_mode="rgb_array"`)."""
         return self.make(**kwargs) if self.make else gymnasium.make(self.env_id, **kwargs)
-
-
-_TASKS: dict[str, Task] = {}
-
-
-def register(task: Task) -> Task:
-    """Makes `task` known by its name."""
-    _TASKS[task.name] = task
-    return task
-
-
-def tasks() -> dict[str, Task]:
-    """All registered tasks by name."""
-    return dict(_TASKS)
-
-
-def get_task(name: str) -> Task:
-    """The task of that name: a registered one (case does not matter), or what `metrpo.world.resolve` makes of it.
-
-    Raises `TaskError` with the nearest names when there is none, and when an environment cannot be used.
-    """
-    by_lower = {known.lower(): task for known, task in _TASKS.items()}
-    if name.lower() in by_lower:
-        return by_lower[name.lower()]
-    from metrpo.world.resolve import resolve  # which makes tasks, and so imports this
-
-    found = resolve(name)
-    if found is not None:
-        return found
-    names = [*by_lower, *(known.lower() for known in gymnasium.registry)]
-    original = {known.lower(): known for known in (*_TASKS, *gymnasium.registry)}
-    near = [original[n] for n in difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.4)]
-    hint = f"did you mean {' or '.join(near)}? " if near else ""
-    raise TaskError(
-        f"unknown task {name!r}: {hint}known tasks: {', '.join(_TASKS)} (see: metrpo tasks), any Gymnasium id, "
-        "module:name or path/to/file.py:name"
-    )

@@ -1,0 +1,69 @@
+"""The tasks that are known by name, and how a name becomes a task."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+from functools import cache
+
+import gymnasium
+
+from metrpo.errors import TaskError
+from metrpo.world.known import KNOWN
+from metrpo.world.resolve import resolve, task_of
+from metrpo.world.task import Task
+
+_TASKS: dict[str, Task] = {}
+
+
+def register(task: Task) -> Task:
+    """Makes `task` known by its name."""
+    _TASKS[task.name] = task
+    return task
+
+
+def tasks() -> dict[str, Task]:
+    """All registered tasks by name."""
+    return dict(_TASKS)
+
+
+def get_task(name: str) -> Task:
+    """The task of that name: a registered one (case does not matter), one that comes with its formulas
+    (`metrpo.world.known`), or what `metrpo.world.resolve` makes of it.
+
+    Raises `TaskError` with the nearest names when there is none, and when an environment cannot be used.
+    """
+    by_lower = {known.lower(): task for known, task in _TASKS.items()}
+    if name.lower() in by_lower:
+        return by_lower[name.lower()]
+    found = _with_formulas(name) if name in KNOWN else resolve(name)
+    if found is not None:
+        return found
+    original = {known.lower(): known for known in (*_TASKS, *KNOWN, *gymnasium.registry)}
+    names = list(original)
+    near = [original[n] for n in difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.4)]
+    hint = f"did you mean {' or '.join(near)}? " if near else ""
+    raise TaskError(
+        f"unknown task {name!r}: {hint}known tasks: {', '.join(_TASKS)} (see: metrpo tasks), any Gymnasium id, "
+        "module:name or path/to/file.py:name"
+    )
+
+
+@cache
+def without_formulas(task: Task) -> Task:
+    """The task with reward and end of episode to be learned; the same object every time."""
+    return dataclasses.replace(task, reward=None, terminated="learned")
+
+
+@cache
+def _with_formulas(name: str) -> Task:
+    known = KNOWN[name]
+    task = task_of(
+        known.make,
+        known.reward,
+        known.terminated,
+        name=name,
+        unseen=known.unseen,
+        description=known.description,
+    )
+    return task if known.terminated else dataclasses.replace(task, terminated=None)
