@@ -282,3 +282,46 @@ def test_step_rand_is_compute_all_then_pick(count, members):
 
 def test_the_sampling_stands_in_the_table():
     assert imagining.SAMPLINGS["step_rand"] is step_rand
+
+
+# ---------------------------------------------------------------- exploration by disagreement
+
+
+def slow_disagreement(ensemble, state, action):
+    deltas = np.array([slow_delta(ensemble, k, state, action) for k in range(ensemble.members)])
+    return (deltas.std(axis=0) / ensemble.normaliser.delta_std).mean()
+
+
+def test_disagreement_is_the_spread_of_the_predictions():
+    ensemble = random_ensemble(0, members=4)
+    rng = np.random.default_rng(0)
+    states, actions = rng.normal(size=(5, 4)).astype(np.float32), rng.uniform(-1, 1, (5, 2)).astype(np.float32)
+    got = jax.jit(imagining.disagreement)(ensemble, states, actions)
+    expected = [slow_disagreement(ensemble, s, a) for s, a in zip(states, actions, strict=True)]
+    np.testing.assert_allclose(got, expected, rtol=1e-4)
+    assert np.abs(jax.jit(imagining.disagreement)(true_dynamics(), states[:, :2], actions)).max() < 1e-4
+
+
+def test_curiosity_adds_the_disagreement_to_imagined_rewards_and_values():
+    ensemble = random_ensemble(1, members=3, state_size=2, action_size=2, scale=0.3)
+    policy, starts = random_policy(2, 2, 2), probe.starts(4).astype(np.float32)
+    act = partial(gaussian.sample, policy)
+    run = jax.jit(lambda c: imagine(ensemble, act, probe.reward, None, starts, 6, KEY, curiosity=c), static_argnums=0)
+    (plain, _), (curious, info) = run(0.0), run(0.5)
+    np.testing.assert_array_equal(plain.states, curious.states)
+    spread = [
+        [slow_disagreement(ensemble, s, np.clip(a, -1, 1)) for s, a in zip(*row, strict=True)]
+        for row in zip(np.asarray(plain.states), np.asarray(plain.actions), strict=True)
+    ]
+    np.testing.assert_allclose(curious.rewards - plain.rewards, 0.5 * np.array(spread), atol=1e-4)
+    assert float(info.mean_return) == pytest.approx(float(curious.rewards.sum(0).mean()), rel=1e-4)
+    mean = partial(gaussian.mean, policy)
+    value = jax.jit(lambda c: returns_per_model(ensemble, mean, probe.reward, None, starts, 6, c), static_argnums=0)
+    expected = np.zeros(3)
+    for k in range(3):
+        for state in starts.astype(float):
+            for _ in range(6):
+                action = np.clip(slow_mean(policy, state), -1, 1)
+                expected[k] += 0.5 * slow_disagreement(ensemble, state, action) / len(starts)
+                state = state + slow_delta(ensemble, k, state, action)
+    np.testing.assert_allclose(value(0.5) - value(0.0), expected, atol=1e-4)

@@ -125,9 +125,12 @@ class ImagineConfig:
     """Start states of imagined episodes: those of real episodes in the dataset, or fresh real resets (uncounted)."""
     products: Literal["float32", "bfloat16"] = "float32"
     """Type of the operands of the ensemble's matrix products, in imagination and in validation."""
+    disagreement: float = 0.0
+    """Added to every imagined reward: this times how far the models' predictions spread, in each dimension's std."""
 
     def __post_init__(self) -> None:
         _require(self.steps >= 1, "imagine.steps", self.steps, "at least 1")
+        _require(_nonnegative(self.disagreement), "imagine.disagreement", self.disagreement, "a finite number >= 0")
 
 
 @dataclass(frozen=True)
@@ -348,6 +351,7 @@ BUDGET_FIELDS = ("iterations", "real_steps")
 ADDED = (
     "config.fit.products",
     "config.imagine.products",
+    "config.imagine.disagreement",
     "config.trpo.fisher_every",
     "config.system",
     "config.method",

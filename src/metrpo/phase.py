@@ -73,7 +73,7 @@ def improve(
     fixed_starts = pool[rng.integers(len(pool), size=config.validate.starts)]
 
     def judge(policy: Policy, imagined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        values = values_of(task, ensemble, policy, fixed_starts)
+        values = values_of(task, ensemble, policy, fixed_starts, config.imagine.disagreement)
         return values, rule.evidence(Evidence(values, imagined, partial(oracle, policy)))
 
     memory = init_memory(config, policy, baseline)
@@ -137,7 +137,8 @@ def _compiled_updates(
     ) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
         def simulate(act: Act, starts: Array, key: Array) -> tuple[Trajectories, ImagineInfo]:
             ends, sampling = task.terminated, config.imagine.sampling
-            return imagine(ensemble, act, task.reward, ends, starts, task.horizon, key, sampling, AXIS)
+            curiosity = config.imagine.disagreement
+            return imagine(ensemble, act, task.reward, ends, starts, task.horizon, key, sampling, AXIS, curiosity)
 
         def update(
             carry: tuple[Policy, Memory], given: tuple[Array, Array]
@@ -176,11 +177,13 @@ def _updates(
     return _compiled_updates(task, relevant, mesh, ensemble, policy, memory, starts, keys)
 
 
-@partial(jax.jit, static_argnames=("task", "mesh"))
-def _compiled_validate(task: Task, mesh: Mesh, ensemble: Ensemble, policy: Policy, starts: Array) -> Array:
+@partial(jax.jit, static_argnames=("task", "mesh", "curiosity"))
+def _compiled_validate(
+    task: Task, mesh: Mesh, curiosity: float, ensemble: Ensemble, policy: Policy, starts: Array
+) -> Array:
     def values(ensemble: Ensemble, policy: Policy, starts: Array) -> Array:
         mine = returns_per_model(
-            ensemble, partial(gaussian.mean, policy), task.reward, task.terminated, starts, task.horizon
+            ensemble, partial(gaussian.mean, policy), task.reward, task.terminated, starts, task.horizon, curiosity
         )
         return jax.lax.pmean(mine, AXIS)
 
@@ -190,8 +193,11 @@ def _compiled_validate(task: Task, mesh: Mesh, ensemble: Ensemble, policy: Polic
     )(ensemble, policy, starts)
 
 
-def values_of(task: Task, ensemble: Ensemble, policy: Policy, starts: np.ndarray) -> np.ndarray:
-    """[K]: mean return of the deterministic policy from `starts` [N, S] in each model alone."""
+def values_of(task: Task, ensemble: Ensemble, policy: Policy, starts: np.ndarray, curiosity: float = 0.0) -> np.ndarray:
+    """[K]: mean return of the deterministic policy from `starts` [N, S] in each model alone.
+
+    Rewards hold `curiosity` times the models' disagreement.
+    """
     mesh = devices.mesh(len(starts), AXIS)
     ensemble, policy = devices.copied((ensemble, policy), mesh)
-    return np.asarray(_compiled_validate(task, mesh, ensemble, policy, starts))
+    return np.asarray(_compiled_validate(task, mesh, curiosity, ensemble, policy, starts))

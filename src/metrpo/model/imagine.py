@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from metrpo.devices import across, share_of
-from metrpo.model.ensemble import Ensemble, first_member, predict
+from metrpo.model.ensemble import Ensemble, first_member, predict, predict_delta
 from metrpo.types import Act, Array, Trajectories
 
 Reward = Callable[[Array, Array, Array], Array]
@@ -135,6 +135,17 @@ def outcome(
     return following, rewards, None if terminated is None else terminated(following)
 
 
+def disagreement(ensemble: Ensemble, states: Array, actions: Array) -> Array:
+    """How far the models' predictions spread, [N, S], [N, A] -> [N]: their standard deviation, in units of each
+    dimension's std in the data, mean over the dimensions (the paper's section "Discussion": a reason to explore)."""
+
+    def all_models(x: Array) -> Array:
+        return jnp.broadcast_to(x, (ensemble.members, *x.shape))
+
+    deltas = predict_delta(ensemble, all_models(states), all_models(actions)) / ensemble.normaliser.delta_std
+    return jnp.mean(jnp.std(deltas, axis=0), axis=-1)
+
+
 def imagine(
     ensemble: Ensemble,
     act: Act,
@@ -145,10 +156,12 @@ def imagine(
     key: Array,
     sampling: str = "step_rand",
     axis: str | None = None,
+    curiosity: float = 0.0,
 ) -> tuple[Trajectories, ImagineInfo]:
     """Imagined episodes of `horizon` steps from `starts` [N, S].
 
-    Actions are clipped to [-1, 1] for dynamics and reward, and recorded as drawn. With `axis`, `starts` are this
+    Actions are clipped to [-1, 1] for dynamics and reward, and recorded as drawn. Rewards hold `curiosity` times the
+    models' disagreement. With `axis`, `starts` are this
     device's share of the batch; the trajectories stay with it, the info is about all (see `metrpo.devices`).
     """
     next_state = SAMPLINGS[sampling]
@@ -162,6 +175,8 @@ def imagine(
         clipped = jnp.clip(actions, -1.0, 1.0)
         predicted = next_state(ensemble, states, clipped, Keys(model_key, episode_key))
         following, rewards, ended = outcome(reward, terminated, states, clipped, predicted)
+        if curiosity:
+            rewards = rewards + curiosity * disagreement(ensemble, states, clipped)
         bad = ~(jnp.all(jnp.abs(following) < EXPLODED, axis=-1) & jnp.isfinite(rewards))
         recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive)
         diverged = diverged | (bad & (alive > 0))
@@ -189,8 +204,11 @@ def returns_per_model(
     terminated: Terminated | None,
     starts: Array,
     horizon: int,
+    curiosity: float = 0.0,
 ) -> Array:
     """[K]: mean return of the deterministic policy `act`, full horizon from `starts` [N, S], in each model alone.
+
+    Rewards hold `curiosity` times the models' disagreement.
 
     NaN for a model in which any rollout diverged: such a model cannot vouch for the policy.
     """
@@ -200,6 +218,9 @@ def returns_per_model(
         actions = jnp.clip(act(states), -1.0, 1.0)
         predicted = predict(ensemble, states, actions)
         following, rewards, ended = outcome(reward, terminated, states, actions, predicted)
+        if curiosity:
+            flat = (x.reshape(-1, x.shape[-1]) for x in (states, actions))
+            rewards = rewards + curiosity * disagreement(ensemble, *flat).reshape(rewards.shape)
         sound = jnp.all(jnp.abs(following) < EXPLODED, axis=-1) & jnp.isfinite(rewards)
         # A product with `alive` would let what follows the end through: 0 * inf is NaN.
         total = total + jnp.where(alive > 0, jnp.where(sound, rewards, jnp.nan), 0.0)
