@@ -24,7 +24,7 @@ from metrpo.policy.improve import Memory
 from metrpo.presets import override, preset
 from metrpo.run import clock as clock_module
 from metrpo.run.progress import SILENT, Progress
-from metrpo.world import task as task_module
+from metrpo.world import registry
 
 TINY = override(
     Config(task="Probe", iterations=4, evaluation_episodes=2),
@@ -50,7 +50,7 @@ TINY = override(
 def _probe_is_a_task():
     with pytest.MonkeyPatch.context() as patch:
         for task in (probe.PROBE, probe.ENDING_PROBE):
-            patch.setitem(task_module._TASKS, task.name, task)
+            patch.setitem(registry._TASKS, task.name, task)
         yield
 
 

@@ -27,7 +27,7 @@ from metrpo.run.policy_file import load_policy, save_policy
 from metrpo.run.progress import Progress
 from metrpo.run.report import draw_curve
 from metrpo.seeds import Stage
-from metrpo.world import task as task_module
+from metrpo.world import registry
 
 TINY = override(
     Config(task="Probe", iterations=3, evaluation_episodes=2),
@@ -40,7 +40,7 @@ METHODS = pytest.mark.parametrize("method", ["ppo", "ddpg"])
 def _probe_is_a_task():
     with pytest.MonkeyPatch.context() as patch:
         for task in (probe.PROBE, probe.ENDING_PROBE):
-            patch.setitem(task_module._TASKS, task.name, task)
+            patch.setitem(registry._TASKS, task.name, task)
         yield
 
 

@@ -18,6 +18,8 @@ from metrpo.types import Array
 from metrpo.world.guard import Guarded
 from metrpo.world.task import Task
 
+_DM_CONTROL_STEPS = 1000
+"""Steps of an episode in every task of the control suite (Tassa et al. 2018), which Shimmy does not tell."""
 MakeEnv = Callable[..., gymnasium.Env[Any, Any]]
 Reward = Callable[[Array, Array, Array], Array]
 Terminated = Callable[[Array], Array]
@@ -77,6 +79,8 @@ def resolve(name: str) -> Task | None:
     """
     if name.startswith("dm_control/"):
         _register_dm_control()
+        if name in gymnasium.registry:
+            return task_of(name, horizon=_DM_CONTROL_STEPS)
     if name in gymnasium.registry:
         return task_of(name)
     module, colon, attribute = name.rpartition(":")
