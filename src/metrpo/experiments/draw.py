@@ -73,7 +73,7 @@ def _draw_overfitting(picture: Picture, figure: Figure, curves: list[Curves]) ->
     """Imagined and real return after every policy phase: a row for each system, a column for each seed."""
     columns = max(len(c.runs) for c in curves)
     picture.set_size_inches(4.2 * columns, 3.1 * len(curves))
-    grid = picture.subplots(len(curves), columns, squeeze=False, sharex=True)
+    grid = picture.subplots(len(curves), columns, squeeze=False)
     for row, c in zip(grid, curves, strict=True):
         for axes, (steps, real), (_, imagined), run in zip(
             row, c.column("return_real"), c.column("return_imagined"), c.runs, strict=False

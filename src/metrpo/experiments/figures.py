@@ -64,7 +64,7 @@ FIGURES: dict[str, Figure] = {
         "Imagined and real return with one model",
         "With one model the imagined return rises in each policy phase while the real one falls.",
         {"1 model": "k-1", "5 models": "me-trpo"},
-        ("Swimmer",),
+        ("Swimmer", "HalfCheetah"),  # the paper shows Swimmer
         kind="overfitting",
     ),
     "sampling": Figure(
