@@ -210,3 +210,46 @@ def test_masked_steps_have_no_influence():
 def test_the_first_baseline_predicts_zero():
     assert advantage.init_baseline(S).shape == (2 * S + 4,)
     assert not np.any(advantage.init_baseline(S))
+
+
+# ---------------------------------------------------------------- episodes that are cut off
+
+
+@given(seeds, shares, shares)
+@settings(max_examples=25, deadline=None)
+def test_what_follows_a_cut_is_one_more_value(seed, discount, gae_lambda):
+    """The value after the last step is that of a step more, which itself earns what it is worth."""
+    rng, rewards, values, mask, lengths = a_batch(seed)
+    after = (rng.normal(size=N) * (lengths == T)).astype(np.float32)
+    got = gae(rewards, values, mask, discount, gae_lambda, after)
+    longer = [np.concatenate([x, y[None]]) for x, y in ((rewards, after), (values, after), (mask, lengths == T))]
+    expected = gae(*(x.astype(np.float32) for x in longer), discount, gae_lambda)
+    np.testing.assert_allclose(got, expected[:-1], atol=1e-4)
+
+
+def test_the_value_at_the_cut_is_that_of_the_endless_episode():
+    """A reward of 1 for ever is worth 1 / (1 - discount), though every episode shows 5 steps of it only."""
+    rng, discount = np.random.default_rng(0), 0.9
+    states = rng.normal(size=(6, 40, 2)).astype(np.float32)
+    ones = np.ones((5, 40), np.float32)
+    endless = Trajectories(states[:5], np.zeros((5, 40, 1), np.float32), ones, ones, states[5], ones[0])
+    cut = on_host(static_argnames="cut")(advantage.advantages_and_baseline)
+    baseline = np.zeros(8, np.float32)
+    for _ in range(60):
+        _, baseline = cut(endless, baseline, discount, 1.0, 1e-5, cut=True)
+    np.testing.assert_allclose(features(states)[:1] @ baseline, 10.0, rtol=0.02)
+    baseline = np.zeros(8, np.float32)
+    ending = endless._replace(going_on=0 * ones[0])
+    for _ in range(3):
+        _, baseline = cut(ending, baseline, discount, 1.0, 1e-5, cut=True)
+    # All steps look alike without time: on average (1 + ... ) over 5, 4, 3, 2, 1 steps to go.
+    left = np.mean([(1 - discount**n) / (1 - discount) for n in range(1, 6)])
+    np.testing.assert_allclose(np.mean(features(states)[:5] @ baseline), left, rtol=0.01)
+
+
+def test_without_time_states_alone_make_the_features():
+    states = np.random.default_rng(0).normal(size=(4, 3, 2)).astype(np.float32)
+    with_time = features(states)
+    timeless = on_host(static_argnames="timeless")(advantage.features)(states, timeless=True)
+    np.testing.assert_array_equal(timeless[..., 4:7], 0)
+    np.testing.assert_array_equal(np.delete(timeless, range(4, 7), -1), np.delete(with_time, range(4, 7), -1))

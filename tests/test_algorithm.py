@@ -341,7 +341,7 @@ class Script:
         infos = ImproveInfo(zeros + 0.25, zeros, accepted, zeros, zeros), ImagineInfo(zeros, zeros + 0.5, zeros)
         return moved, memory._replace(baseline=memory.baseline + count), infos
 
-    def _validate(self, task, ensemble, policy, starts, curiosity):
+    def _validate(self, task, ensemble, policy, starts, horizon, curiosity):
         self.fixed_starts.append(starts)
         return np.array(self.values[self.number(policy)], np.float32)
 

@@ -114,6 +114,7 @@ IMPOSSIBLE = {
     "fit.max_steps": [0, -5],
     "fit.reinitialise_every": [-1],
     "imagine.steps": [0],
+    "imagine.horizon": [0, -1],
     "imagine.disagreement": [-1.0, float("nan"), float("inf")],
     "policy.hidden": [(0,)],
     "policy.initial_std": [0.0, -1.0, float("nan")],

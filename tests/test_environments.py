@@ -13,9 +13,9 @@ from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 import probe
 from helpers import linear_ensemble, random_ensemble, random_episode
-from metrpo import algorithm, training
+from metrpo import algorithm, phase, training
 from metrpo.config import CollectConfig, Config
-from metrpo.errors import TaskError
+from metrpo.errors import ConfigError, TaskError
 from metrpo.model.imagine import SAMPLINGS, imagine, outcome, returns_per_model
 from metrpo.policy import gaussian
 from metrpo.presets import override, preset
@@ -471,3 +471,42 @@ def test_the_probe_is_learned_without_knowing_its_reward(blind):
     after = real_return(training.train(LEARN).policy)
     assert before < 4 * optimum
     assert 1.4 * optimum <= after <= optimum * 0.9999
+
+
+# ---------------------------------------------------------------- imagined episodes shorter than the real ones
+
+
+SHORT = {"imagine.horizon": 5, "imagine.start": "anywhere", "advantage.discount": 0.9}
+
+
+def test_short_imagined_episodes_need_a_discount(blind):
+    with pytest.raises(ConfigError, match=r"advantage\.discount: expected less than 1 with imagine\.horizon"):
+        training.init(override(LEARN, {"imagine.horizon": 5}))
+    assert training.init(override(LEARN, SHORT)).iteration == 0
+
+
+def test_short_imagined_episodes_start_anywhere_and_are_more(blind, monkeypatch):
+    config = override(LEARN, {**SHORT, "iterations": 1, "imagine.steps": 100, "validate.max_updates": 5})
+    pools, updates = [], phase._updates
+
+    def spied(task, config, ensemble, policy, memory, starts, key):
+        pools.append(np.asarray(starts))
+        return updates(task, config, ensemble, policy, memory, starts, key)
+
+    monkeypatch.setattr(phase, "_updates", spied)
+    state = training.train(config)
+    assert pools[0].shape == (5, 20, 2), "20 episodes of 5 steps"
+    seen = {row.tobytes() for row in state.dataset.train.states}
+    assert all(row.tobytes() in seen for row in pools[0].reshape(-1, 2))
+    assert phase.imagined_horizon(override(config, {"imagine.horizon": 500}), blind) == 20, (
+        "never longer than real ones"
+    )
+
+
+def test_the_probe_is_learned_in_episodes_of_five_steps(blind):
+    """A fourth of its horizon: what follows the cut comes from the baseline."""
+    p, _ = probe.riccati()
+    optimum = np.mean([-s @ p @ s for s in probe.starts(30)])
+    policy = jax.tree.map(np.asarray, training.train(override(LEARN, SHORT)).policy)
+    episodes = [probe.rollout(probe.PROBE, n, lambda _, s: gaussian.mean(policy, s)) for n in range(30)]
+    assert 1.5 * optimum <= np.mean([rewards.sum() for _, _, rewards in episodes]) <= optimum * 0.9999

@@ -70,6 +70,10 @@ def test_through_the_true_dynamics_imagination_is_reality(task, relu):
         np.testing.assert_allclose(t.rewards[:length, n], rewards, atol=1e-4)
         np.testing.assert_array_equal(t.mask[:, n], np.arange(probe.HORIZON) < length)
         np.testing.assert_array_equal(np.clip(actions[:length, n], -1, 1), executed)
+        ended = task.terminated is not None and bool(task.terminated(states[-1]))
+        assert t.going_on[n] == (not ended)
+        if not ended:
+            np.testing.assert_allclose(t.last[n], states[-1], atol=1e-4)
     assert info.steps == sum(lengths)
     assert info.diverged == 0
     assert info.mean_return == pytest.approx(float((t.rewards * t.mask).sum(0).mean()), rel=1e-5)

@@ -91,6 +91,7 @@ OURS = {
     "fit.max_steps": (None, "an option of `fast`; the paper knows none, so it is off"),
     "system": ("me-trpo", "the label"),
     "method": ("model-based", "the paper's own"),
+    "imagine.horizon": (None, "section 2: the full horizon"),
     "imagine.disagreement": (0.0, "the paper's future work: off"),
     "trust_reward": (False, "the paper's tasks are our own"),
     "learn_reward": (False, "section 2: the reward function is known"),

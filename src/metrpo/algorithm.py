@@ -15,6 +15,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import NamedTuple
 
@@ -23,6 +24,7 @@ import numpy as np
 
 from metrpo import phase
 from metrpo.config import Config
+from metrpo.errors import ConfigError
 from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Ensemble, Networks
 from metrpo.model.fit import FitInfo, fit
@@ -60,8 +62,14 @@ class State(NamedTuple):
 
 
 def init(config: Config) -> State:
-    """The state before the first iteration."""
+    """The state before the first iteration.
+
+    Raises `TaskError` for an unknown task, `ConfigError` for settings that contradict each other.
+    """
     task = task_of(config)
+    if config.imagine.horizon is not None and config.advantage.discount == 1:
+        # Undiscounted, a value that leans on itself grows without bound.
+        raise ConfigError("advantage.discount: expected less than 1 with imagine.horizon (0.99, say), got 1.0")
     policy_key, ensemble_key = jax.random.split(key_of(config.seed, 0, Stage.INIT))
     policy = gaussian.init(
         policy_key, task.state_size, task.action_size, config.policy.hidden, config.policy.initial_std
@@ -108,7 +116,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
         dataset=dataset,
     )
     collected = float(np.mean([e.rewards.sum() for e in episodes]))
-    return state, _row(state, returns, collected, fitted, improved, clock)
+    return state, _row(config, state, returns, collected, fitted, improved, clock)
 
 
 def _fit(
@@ -140,6 +148,8 @@ def _improve(
     clock: Clock,
 ) -> tuple[Policy, Array, PhaseInfo]:
     rng, starts = rng_of(config.seed, iteration, Stage.IMPROVE), dataset.starts
+    if config.imagine.start == "anywhere":
+        starts = dataset.train.states
     if config.imagine.start == "reset":
         starts = real.reset_states(task, max(config.validate.starts, phase.rollouts(config, task)), rng)
     return phase.improve(
@@ -180,7 +190,13 @@ def _perturbed(policy: Policy, previous: Policy, scale: float, rng: np.random.Ge
 
 
 def _row(
-    state: State, returns: np.ndarray, collected: float, fitted: FitInfo, improved: PhaseInfo, clock: Clock
+    config: Config,
+    state: State,
+    returns: np.ndarray,
+    collected: float,
+    fitted: FitInfo,
+    improved: PhaseInfo,
+    clock: Clock,
 ) -> Row:
     imagined = float(np.mean(improved.values))
     losses = np.asarray(fitted.validation_loss)
@@ -191,7 +207,8 @@ def _row(
         "return_real_std": float(np.std(returns)),
         "return_collected": collected,
         "return_imagined": imagined,
-        "gap": imagined - float(np.mean(returns)),
+        # What shorter episodes earn cannot be compared.
+        "gap": math.nan if config.imagine.horizon else imagined - float(np.mean(returns)),
         **{f"validation_loss_{k}": float(loss) for k, loss in enumerate(losses)},
         "train_loss": float(np.mean(fitted.train_loss)),
         "fit_passes": fitted.passes,

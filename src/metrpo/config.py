@@ -121,8 +121,12 @@ class ImagineConfig:
     sampling: Literal["step_rand", "model_mean_std", "model_mean", "model_med", "eps_rand", "one_model"] = "step_rand"
     """How the next state comes out of the ensemble: of a model drawn per step (step_rand) or per episode (eps_rand), of
     the first model, the models' mean or median, or drawn from a normal distribution fitted to them."""
-    start: Literal["dataset", "reset"] = "dataset"
-    """Start states of imagined episodes: those of real episodes in the dataset, or fresh real resets (uncounted)."""
+    start: Literal["dataset", "anywhere", "reset"] = "dataset"
+    """Start states of imagined episodes: those of real episodes in the dataset, any state of the training set, or fresh
+    real resets (uncounted)."""
+    horizon: int | None = None
+    """Steps of an imagined episode, fewer than the task's: what would follow is valued by the baseline, then without
+    regard to time. Needs advantage.discount < 1; goes with start = "anywhere". None: the task's."""
     products: Literal["float32", "bfloat16"] = "float32"
     """Type of the operands of the ensemble's matrix products, in imagination and in validation."""
     disagreement: float = 0.0
@@ -130,6 +134,7 @@ class ImagineConfig:
 
     def __post_init__(self) -> None:
         _require(self.steps >= 1, "imagine.steps", self.steps, "at least 1")
+        _require(self.horizon is None or self.horizon >= 1, "imagine.horizon", self.horizon, "at least 1")
         _require(_nonnegative(self.disagreement), "imagine.disagreement", self.disagreement, "a finite number >= 0")
 
 
@@ -350,6 +355,7 @@ BUDGET_FIELDS = ("iterations", "real_steps")
 
 ADDED = (
     "config.fit.products",
+    "config.imagine.horizon",
     "config.imagine.products",
     "config.imagine.disagreement",
     "config.trpo.fisher_every",

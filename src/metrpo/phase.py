@@ -73,7 +73,8 @@ def improve(
     fixed_starts = pool[rng.integers(len(pool), size=config.validate.starts)]
 
     def judge(policy: Policy, imagined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        values = values_of(task, ensemble, policy, fixed_starts, config.imagine.disagreement)
+        horizon = imagined_horizon(config, task)
+        values = values_of(task, ensemble, policy, fixed_starts, horizon, config.imagine.disagreement)
         return values, rule.evidence(Evidence(values, imagined, partial(oracle, policy)))
 
     memory = init_memory(config, policy, baseline)
@@ -115,7 +116,12 @@ def improve(
 
 def rollouts(config: Config, task: Task) -> int:
     """Imagined episodes per update: enough for `imagine.steps` steps."""
-    return -(-config.imagine.steps // task.horizon)
+    return -(-config.imagine.steps // imagined_horizon(config, task))
+
+
+def imagined_horizon(config: Config, task: Task) -> int:
+    """Steps of an imagined episode."""
+    return min(config.imagine.horizon or task.horizon, task.horizon)
 
 
 @partial(jax.jit, static_argnames=("task", "config", "mesh"))
@@ -137,8 +143,8 @@ def _compiled_updates(
     ) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
         def simulate(act: Act, starts: Array, key: Array) -> tuple[Trajectories, ImagineInfo]:
             ends, sampling = task.terminated, config.imagine.sampling
-            curiosity = config.imagine.disagreement
-            return imagine(ensemble, act, task.reward, ends, starts, task.horizon, key, sampling, AXIS, curiosity)
+            curiosity, horizon = config.imagine.disagreement, imagined_horizon(config, task)
+            return imagine(ensemble, act, task.reward, ends, starts, horizon, key, sampling, AXIS, curiosity)
 
         def update(
             carry: tuple[Policy, Memory], given: tuple[Array, Array]
@@ -177,13 +183,13 @@ def _updates(
     return _compiled_updates(task, relevant, mesh, ensemble, policy, memory, starts, keys)
 
 
-@partial(jax.jit, static_argnames=("task", "mesh", "curiosity"))
+@partial(jax.jit, static_argnames=("task", "mesh", "horizon", "curiosity"))
 def _compiled_validate(
-    task: Task, mesh: Mesh, curiosity: float, ensemble: Ensemble, policy: Policy, starts: Array
+    task: Task, mesh: Mesh, horizon: int, curiosity: float, ensemble: Ensemble, policy: Policy, starts: Array
 ) -> Array:
     def values(ensemble: Ensemble, policy: Policy, starts: Array) -> Array:
         mine = returns_per_model(
-            ensemble, partial(gaussian.mean, policy), task.reward, task.terminated, starts, task.horizon, curiosity
+            ensemble, partial(gaussian.mean, policy), task.reward, task.terminated, starts, horizon, curiosity
         )
         return jax.lax.pmean(mine, AXIS)
 
@@ -193,11 +199,18 @@ def _compiled_validate(
     )(ensemble, policy, starts)
 
 
-def values_of(task: Task, ensemble: Ensemble, policy: Policy, starts: np.ndarray, curiosity: float = 0.0) -> np.ndarray:
+def values_of(
+    task: Task,
+    ensemble: Ensemble,
+    policy: Policy,
+    starts: np.ndarray,
+    horizon: int | None = None,
+    curiosity: float = 0.0,
+) -> np.ndarray:
     """[K]: mean return of the deterministic policy from `starts` [N, S] in each model alone.
 
-    Rewards hold `curiosity` times the models' disagreement.
+    Over the task's horizon unless another is given; rewards hold `curiosity` times the models' disagreement.
     """
     mesh = devices.mesh(len(starts), AXIS)
     ensemble, policy = devices.copied((ensemble, policy), mesh)
-    return np.asarray(_compiled_validate(task, mesh, curiosity, ensemble, policy, starts))
+    return np.asarray(_compiled_validate(task, mesh, horizon or task.horizon, curiosity, ensemble, policy, starts))

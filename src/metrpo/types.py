@@ -66,6 +66,10 @@ class Trajectories(NamedTuple):
     """[T, N]"""
     mask: Array
     """[T, N], 1 where the step counts: 0 after termination and in rollouts that diverged."""
+    last: Array = None
+    """[N, S], the states after the last step."""
+    going_on: Array = None
+    """[N], 1 where the episode has neither ended nor diverged by then."""
 
 
 Act = Callable[[Array, Array], Array]

@@ -188,13 +188,13 @@ def imagine(
 
     count = starts.shape[0]
     carry = (starts, jnp.ones(count), jnp.zeros(count, bool))
-    (_, _, diverged), trajectories = jax.lax.scan(step, carry, jax.random.split(key, horizon))
+    (last, alive, diverged), trajectories = jax.lax.scan(step, carry, jax.random.split(key, horizon))
     mask = trajectories.mask * (1.0 - diverged)
     total, lost, rollouts, steps = across(
         (jnp.sum(trajectories.rewards * mask), jnp.sum(diverged), jnp.float32(count), jnp.sum(mask)), axis
     )
     info = ImagineInfo(total / jnp.maximum(rollouts - lost, 1), lost / rollouts, steps)
-    return trajectories._replace(mask=mask), info
+    return trajectories._replace(mask=mask, last=last, going_on=alive * (1.0 - diverged)), info
 
 
 def returns_per_model(

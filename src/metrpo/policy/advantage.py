@@ -9,11 +9,15 @@ from metrpo.devices import across
 from metrpo.types import Array, Trajectories
 
 
-def features(states: Array) -> Array:
-    """The baseline's features [o, o^2, t/100, (t/100)^2, (t/100)^3, 1], |o| <= 10: [T, N, S] -> [T, N, 2S + 4]."""
+def features(states: Array, timeless: bool = False) -> Array:
+    """The baseline's features [o, o^2, t/100, (t/100)^2, (t/100)^3, 1], |o| <= 10: [T, N, S] -> [T, N, 2S + 4].
+
+    `timeless` leaves t at 0.
+    """
     observed = jnp.clip(states, -10.0, 10.0)
     steps, count, _ = states.shape
-    t = jnp.broadcast_to((jnp.arange(steps, dtype=states.dtype) / 100.0)[:, None, None], (steps, count, 1))
+    time = jnp.zeros(steps) if timeless else jnp.arange(steps, dtype=states.dtype) / 100.0
+    t = jnp.broadcast_to(time[:, None, None], (steps, count, 1))
     return jnp.concatenate([observed, jnp.square(observed), t, t**2, t**3, jnp.ones_like(t)], axis=-1)
 
 
@@ -48,12 +52,16 @@ def discounted_returns(rewards: Array, mask: Array, discount: float) -> Array:
     return jax.lax.scan(step, jnp.zeros(rewards.shape[1]), (rewards, mask), reverse=True)[1]
 
 
-def gae(rewards: Array, values: Array, mask: Array, discount: float, gae_lambda: float) -> Array:
+def gae(
+    rewards: Array, values: Array, mask: Array, discount: float, gae_lambda: float, after: Array | None = None
+) -> Array:
     """Generalised advantage estimates [T, N] (Schulman et al. 2016); the value after the last step that counts is 0.
 
     The episode ends there, by termination or by the horizon, which belongs to the task: the return is that of T steps.
+    Episodes that were cut off bring the value `after` [N] their last step.
     """
-    following = jnp.concatenate([(values * mask)[1:], jnp.zeros_like(values[:1])])
+    after = jnp.zeros_like(values[:1]) if after is None else after[None]
+    following = jnp.concatenate([(values * mask)[1:], after])
     errors = mask * (rewards + discount * following - values)
     return discounted_returns(errors, mask, discount * gae_lambda)
 
@@ -73,14 +81,22 @@ def advantages_and_baseline(
     gae_lambda: float,
     ridge: float,
     axis: str | None = None,
+    cut: bool = False,
 ) -> tuple[Array, Array]:
     """Standardised advantages [T, N] under `baseline`, and the baseline refitted to this batch for the next one.
 
-    With `axis`, the trajectories are this device's share of the batch (see `metrpo.devices`).
+    Trajectories that were `cut` off before their end go on with the baseline's value, which then knows no time. With
+    `axis`, the trajectories are this device's share of the batch (see `metrpo.devices`).
     """
-    feature = features(trajectories.states)
+    rewards, mask = trajectories.rewards, trajectories.mask
+    feature = features(trajectories.states, timeless=cut)
     values = feature @ baseline
-    advantages = gae(trajectories.rewards, values, trajectories.mask, discount, gae_lambda)
-    returns = discounted_returns(trajectories.rewards, trajectories.mask, discount)
+    if cut:
+        after = trajectories.going_on * (features(trajectories.last[None], timeless=True)[0] @ baseline)
+        advantages = gae(rewards, values, mask, discount, gae_lambda, after)
+        rewards = rewards.at[-1].add(discount * after)
+    else:
+        advantages = gae(rewards, values, mask, discount, gae_lambda)
+    returns = discounted_returns(rewards, mask, discount)
     refitted = fit_baseline(feature, returns, trajectories.mask, ridge, axis)
     return standardise(advantages, trajectories.mask, axis), refitted

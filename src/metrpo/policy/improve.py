@@ -49,7 +49,7 @@ def batch_of(config: Config, rollouts: Trajectories, baseline: Array, axis: str 
     """The rollouts [T, N] as a batch of T N steps with their advantages under `baseline`; and the baseline refitted."""
     a = config.advantage
     advantages, baseline = advantage.advantages_and_baseline(
-        rollouts, baseline, a.discount, a.gae_lambda, a.ridge, axis
+        rollouts, baseline, a.discount, a.gae_lambda, a.ridge, axis, cut=config.imagine.horizon is not None
     )
     batch = Batch(rollouts.states, rollouts.actions, advantages, rollouts.mask)
     # Episode by episode: every n-th step is then one of every episode, whatever their number.
