@@ -84,6 +84,7 @@ REAL_STEPS = {**dict.fromkeys(TASKS, 300_000), "Ant": 600_000, "Humanoid": 2_400
 OURS = {
     "preset": ("paper", "the label"),
     "seed": (0, "any will do"),
+    "data": (None, "nothing is logged elsewhere"),
     "real_steps": (None, "the budget is given in iterations"),
     "evaluation_episodes": (20, "reporting only: nothing is learned from it"),
     "deterministic": (False, "how the machine computes, not what"),

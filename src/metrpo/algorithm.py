@@ -37,6 +37,7 @@ from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.types import Array
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
+from metrpo.world import logged
 from metrpo.world.dataset import Dataset
 from metrpo.world.registry import get_task, without_formulas
 from metrpo.world.task import Task
@@ -81,7 +82,7 @@ def init(config: Config) -> State:
         previous_policy=policy,
         networks=_fresh_networks(config, task, ensemble_key),
         baseline=advantage.init_baseline(task.state_size),
-        dataset=datasets.empty(task.state_size, task.action_size, len(task.learned)),
+        dataset=_logged(config, task),
     )
 
 
@@ -91,12 +92,15 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
     iteration = state.iteration + 1
     clock = Clock()
     with clock("collect"):
-        progress.stage("collect", config.collect.steps)
+        wanted = 0 if config.real_steps == 0 else config.collect.steps
+        progress.stage("collect", wanted)
         rng = rng_of(config.seed, iteration, Stage.COLLECT)
         mean = partial(_perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise)
         explorer = lambda rng: real.explore(mean(rng), config.collect, rng)  # noqa: E731
-        episodes = real.collect(task, explorer, config.collect.steps, rng, progress.update)
-        dataset = datasets.add(state.dataset, episodes, config.collect, rng, task.learned)
+        episodes = real.collect(task, explorer, wanted, rng, progress.update)
+        dataset = (
+            datasets.add(state.dataset, episodes, config.collect, rng, task.learned) if episodes else state.dataset
+        )
     with clock("fit"):
         progress.stage("fit", None)
         ensemble, fitted = _fit(config, task, state.networks, dataset, iteration, progress)
@@ -115,7 +119,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
         baseline=baseline,
         dataset=dataset,
     )
-    collected = float(np.mean([e.rewards.sum() for e in episodes]))
+    collected = float(np.mean([e.rewards.sum() for e in episodes])) if episodes else math.nan
     return state, _row(config, state, returns, collected, fitted, improved, clock)
 
 
@@ -165,6 +169,17 @@ def _improve(
         lambda updates, accepted, value: progress.update(updates, f"accepted {accepted}, imagined return {value:.2f}"),
         lambda policy: float(np.mean(evaluate(config, task, policy, iteration))),
     )
+
+
+def _logged(config: Config, task: Task) -> Dataset:
+    """The dataset before the first iteration: what was logged elsewhere, or nothing."""
+    nothing = datasets.empty(task.state_size, task.action_size, len(task.learned))
+    if config.data is None:
+        if config.real_steps == 0:
+            raise ConfigError("real_steps: expected at least 1 without logged transitions to learn from (data), got 0")
+        return nothing
+    rng = rng_of(config.seed, 0, Stage.COLLECT)
+    return datasets.add(nothing, logged.load(config.data, task), config.collect, rng, task.learned)
 
 
 def task_of(config: Config) -> Task:

@@ -313,7 +313,10 @@ class Config:
     iterations: int = 10
     """Outer iterations; may be raised later to go on with a finished run."""
     real_steps: int | None = None
-    """Instead of `iterations`: go on until this many real steps have been collected."""
+    """Instead of `iterations`: go on until this many real steps have been collected. 0: collect none, learn from `data`
+    alone for `iterations`."""
+    data: str | None = None
+    """An .npz of logged transitions to start from (see `metrpo.world.logged`)."""
     system: System = "me-trpo"
     """Which of the paper's systems the values describe (see `metrpo.systems`); a label, the values themselves count."""
     method: Literal["model-based", "trpo", "ppo", "ddpg", "svg"] = "model-based"
@@ -346,7 +349,7 @@ class Config:
         _require(bool(self.task), "task", self.task, "a task name")
         _require(0 <= self.seed < 2**31, "seed", self.seed, "between 0 and 2^31 - 1")
         _require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
-        _require(self.real_steps is None or self.real_steps >= 1, "real_steps", self.real_steps, "at least 1")
+        _require(self.real_steps is None or self.real_steps >= 0, "real_steps", self.real_steps, "at least 0")
         _require(self.evaluation_episodes >= 1, "evaluation_episodes", self.evaluation_episodes, "at least 1")
 
 
@@ -364,6 +367,7 @@ ADDED = (
     "config.gradient",
     "config.ppo",
     "config.svg",
+    "config.data",
     "config.learn_reward",
     "config.trust_reward",
 )

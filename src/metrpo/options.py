@@ -25,6 +25,7 @@ class Train(Config):
         metrpo train Swimmer
         metrpo train HalfCheetah --seed 1 --real-steps 60000 --run-dir runs/cheetah
         metrpo train Swimmer --system ppo
+        metrpo train Swimmer --data log.npz --real-steps 0 --run-dir runs/offline
         metrpo train Pendulum-v1                          # any Gymnasium id; reward and end are learned
         metrpo train path/to/file.py:task                 # a task or a function that makes an environment
         metrpo train Swimmer --preset paper --ensemble.members 10 --trpo.max-kl 0.02 --ensemble.hidden 512 512
@@ -39,7 +40,9 @@ class Train(Config):
     iterations: Annotated[int, _BUDGET] = 10
     """Outer iterations; may be raised later to go on with a finished run."""
     real_steps: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
-    """Instead of --iterations: go on until this many real steps have been collected."""
+    """Instead of --iterations: go on until this many real steps have been collected; 0: learn from --data alone."""
+    data: Annotated[str | None, arg(metavar="FILE")] = None
+    """An .npz of logged transitions to start from: states, actions, rewards, next_states, terminated."""
     run_dir: Annotated[Path | None, arg(metavar="DIR")] = None
     """Where the run lives; default: runs/<task>-[<system>-]<preset>-seed<seed>."""
     device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="{cpu,gpu}")] = None

@@ -17,6 +17,7 @@ import numpy as np
 
 from metrpo.algorithm import Row
 from metrpo.config import Config
+from metrpo.errors import ConfigError
 from metrpo.run.directory import RunDirectory, Saved
 from metrpo.run.progress import SILENT, Progress
 from metrpo.seeds import Stage, rng_of
@@ -35,7 +36,12 @@ METHODS = {
 
 
 def init(config: Config) -> Saved:
-    """The state before the first iteration of the config's method."""
+    """The state before the first iteration of the config's method.
+
+    Raises `TaskError` for an unknown task or unfitting data, `ConfigError` for settings that contradict each other.
+    """
+    if config.method != "model-based" and (config.data is not None or config.real_steps == 0):
+        raise ConfigError(f"data: only the method model-based learns from logged transitions, got {config.method}")
     state: Saved = import_module(METHODS[config.method]).init(config)
     return state
 
@@ -89,7 +95,7 @@ def _loop(config: Config, state: Saved, progress: Progress, save: Callable[[Save
 
 
 def _iterations_left(config: Config, state: Saved) -> int | None:
-    if config.real_steps is None:
+    if not config.real_steps:
         return config.iterations - state.iteration
     if not state.iteration:
         return None
@@ -98,6 +104,6 @@ def _iterations_left(config: Config, state: Saved) -> int | None:
 
 def finished(config: Config, state: Saved) -> bool:
     """Whether the budget, iterations or real steps, is spent."""
-    if config.real_steps is not None:
+    if config.real_steps:
         return state.real_steps >= config.real_steps
     return state.iteration >= config.iterations
