@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
@@ -170,13 +169,31 @@ def test_a_run_that_fails_does_not_stop_the_others_and_is_told_with_its_last_wor
     assert "[4/4] Swimmer/k-1/seed-3" in text
 
 
-def test_as_many_at_a_time_as_jobs(tmp_path, trained):
-    outcomes, _ = trained
-    all_runs = runs("k-1", 4)
-    outcomes.update({run: (3, 0, 0.5) for run in all_runs})
-    started = time.monotonic()
-    running.reproduce(all_runs, tmp_path, 4, lambda line: None)
-    assert time.monotonic() - started < 1.9, "one after the other takes two seconds"
+MEET = """
+import pathlib, sys, time
+mine, other = map(pathlib.Path, sys.argv[1:])
+(mine / "began").touch()
+for _ in range(1200):
+    if (other / "began").exists():
+        break
+    time.sleep(0.05)
+else:
+    sys.exit("the other run did not begin while this one ran")
+(mine / "metrics.csv").write_text("iteration,real_steps,return_real\\n3,30,1.5\\n")
+"""
+
+
+def test_as_many_at_a_time_as_jobs(tmp_path, monkeypatch):
+    """Each of two runs waits for the other."""
+    pair = runs("k-1", 2)
+    there = {run: tmp_path / run.name for run in pair}
+
+    def command(run, directory):
+        return [sys.executable, "-c", MEET, str(there[run]), str(there[pair[run is pair[0]]])]
+
+    monkeypatch.setattr(running, "_command", command)
+    monkeypatch.setattr(running, "_POLL", 0.02)
+    assert running.reproduce(pair, tmp_path, 2, lambda line: None) == []
 
 
 def test_stopping_ends_the_runs_too(tmp_path, trained, monkeypatch):
