@@ -66,6 +66,7 @@ np.savez(OUT, *jax.tree.leaves(out))
 
 IMAGINE = """
 from metrpo.model.imagine import imagine
+from metrpo.types import Trajectories
 ensemble = random_ensemble(members=3, scale=0.3)
 starts = np.random.default_rng(1).normal(size=(6, 4)).astype(np.float32)
 mesh = devices.mesh(6, "rollouts")
@@ -74,7 +75,8 @@ def work(starts):
     act = lambda states, key: jnp.zeros((len(states), 2)) + jax.random.normal(key, (len(states), 2))
     return imagine(ensemble, act, lambda s, a, n: n[:, 0], None, starts, 5, jax.random.key(0), axis="rollouts")
 
-share = P(None, "rollouts")
+second, first = P(None, "rollouts"), P("rollouts")
+share = Trajectories(second, second, second, second, last=first, going_on=first)
 t, info = jax.jit(
     jax.shard_map(work, mesh=mesh, in_specs=P("rollouts"), out_specs=(share, P()), check_vma=False)
 )(starts)

@@ -209,8 +209,13 @@ def test_stopping_ends_the_runs_too(tmp_path, trained, monkeypatch):
         return processes[-1]
 
     monkeypatch.setattr(running.subprocess, "Popen", remembered)
-    with pytest.raises(KeyboardInterrupt):
-        running.reproduce([run], tmp_path, 1, lambda line: None)
+    # A shell that starts the tests in the background has Ctrl-C ignored.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            running.reproduce([run], tmp_path, 1, lambda line: None)
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert processes[0].poll() == -signal.SIGTERM
     assert begun == [run]
 

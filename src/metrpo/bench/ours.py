@@ -176,8 +176,9 @@ def _imagine(width: str, products: str) -> Work:
         act = partial(gaussian.sample, policy)
         return imagine(ensemble, act, task.reward, task.terminated, starts, HORIZON, key, "step_rand", phase.AXIS)
 
-    share = PartitionSpec(None, phase.AXIS)
-    specs: Any = {"in_specs": (whole, whole, PartitionSpec(phase.AXIS), whole), "out_specs": (share, whole)}
+    first, second = PartitionSpec(phase.AXIS), PartitionSpec(None, phase.AXIS)
+    imagined = Trajectories(second, second, second, second, last=first, going_on=first)
+    specs: Any = {"in_specs": (whole, whole, first, whole), "out_specs": (imagined, whole)}
     run = jax.jit(jax.shard_map(rollouts, mesh=mesh, check_vma=False, **specs))
     given = (*devices.copied((ensemble, policy), mesh), _starts(ROLLOUTS), jax.random.key(0))
     steps = ROLLOUTS * HORIZON

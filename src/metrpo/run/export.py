@@ -39,10 +39,10 @@ def export(run_dir: Path, out: Path | None = None) -> Path:
     out = source.with_name("policy.py") if out is None else out
     if out.suffix not in _WRITERS:
         raise MetrpoError(f"{out}: expected a name that ends in {', '.join(_WRITERS)}; got {out.suffix or 'no ending'}")
-    if out.suffix == ".py" and out.exists() and not out.read_text(errors="replace").startswith(_SOURCE[:40]):
-        raise MetrpoError(f"{out} exists and is no exported policy: choose another name, or remove it first")
     policy = load_policy(run_dir)
     _check(policy, source)
+    if out.suffix == ".py" and out.is_file() and not out.read_text(errors="replace").startswith(_SOURCE[:40]):
+        raise MetrpoError(f"{out} exists and is no exported policy: choose another name, or remove it first")
     atomic_write(out, _WRITERS[out.suffix](policy, source))
     return out
 
