@@ -6,9 +6,15 @@ every start, so that the Riccati recursion gives the optimum of the clipped syst
 
 from __future__ import annotations
 
-import gymnasium
-import numpy as np
+import contextlib
 
+import gymnasium
+import jax
+import numpy as np
+import pytest
+
+from helpers import slow_mean
+from metrpo.world import registry
 from metrpo.world.task import Task
 
 A = np.array([[1.0, 0.2], [-0.2, 1.0]])
@@ -100,3 +106,43 @@ def rollout(task, seed, act):
         over = terminated or truncated
     env.close()
     return np.array(states), np.array(actions), np.array(rewards)
+
+
+def optimum():
+    """The optimal return, mean over 30 starts."""
+    p, _ = riccati()
+    return np.mean([-s @ p @ s for s in starts(30)])
+
+
+def real_return(policy):
+    """Real return of the mean action, from the starts of `optimum`."""
+    host = jax.tree.map(np.asarray, policy)
+    episodes = [rollout(PROBE, n, lambda _, s: slow_mean(host, s)) for n in range(30)]
+    return np.mean([rewards.sum() for _, _, rewards in episodes])
+
+
+@contextlib.contextmanager
+def registered():
+    """The probes as tasks that are known by name."""
+    with pytest.MonkeyPatch.context() as patch:
+        for task in (PROBE, ENDING_PROBE):
+            patch.setitem(registry._TASKS, task.name, task)
+        yield
+
+
+LEARN = {
+    "collect.max_train": 1000,
+    "collect.max_validation": 500,
+    "ensemble.members": 3,
+    "ensemble.hidden": (16,),
+    "fit.batch_size": 50,
+    "fit.learning_rate": 0.01,
+    "fit.max_passes": 100,
+    "imagine.steps": 2000,
+    "policy.hidden": (8,),
+    "policy.initial_std": 0.5,
+    "trpo.max_kl": 0.03,
+    "validate.max_updates": 60,
+    "validate.starts": 50,
+}
+"""Settings with which the whole loop learns the probe within seconds."""

@@ -24,7 +24,6 @@ from metrpo.policy.improve import Memory
 from metrpo.presets import override, preset
 from metrpo.run import clock as clock_module
 from metrpo.run.progress import SILENT, Progress
-from metrpo.world import registry
 
 TINY = override(
     Config(task="Probe", iterations=4, evaluation_episodes=2),
@@ -48,9 +47,7 @@ TINY = override(
 
 @pytest.fixture(scope="module", autouse=True)
 def _probe_is_a_task():
-    with pytest.MonkeyPatch.context() as patch:
-        for task in (probe.PROBE, probe.ENDING_PROBE):
-            patch.setitem(registry._TASKS, task.name, task)
+    with probe.registered():
         yield
 
 
@@ -515,40 +512,18 @@ def test_a_block_of_updates_is_imagination_advantages_and_trpo_one_after_the_oth
 
 LEARN = override(
     Config(task="Probe", iterations=2, evaluation_episodes=20),
-    {
-        "collect.steps": 300,
-        "collect.max_train": 1000,
-        "collect.max_validation": 500,
-        "ensemble.members": 3,
-        "ensemble.hidden": (16,),
-        "fit.batch_size": 50,
-        "fit.learning_rate": 0.01,
-        "fit.max_passes": 100,
-        "imagine.steps": 2000,
-        "policy.hidden": (8,),
-        "policy.initial_std": 0.5,
-        "trpo.max_kl": 0.03,
-        "validate.max_updates": 60,
-        "validate.starts": 50,
-    },
+    {**probe.LEARN, "collect.steps": 300},
 )
 
 
 def test_the_whole_loop_finds_the_optimum_of_the_probe():
     """Within 4 % of the Riccati return, from 600 real steps; the initial policies earn several times less."""
-    p, _ = probe.riccati()
-    optimum = np.mean([-s @ p @ s for s in probe.starts(30)])
-
-    def real_return(policy):
-        host = jax.tree.map(np.asarray, policy)
-        episodes = [probe.rollout(probe.PROBE, n, lambda _, s: gaussian.mean(host, s)) for n in range(30)]
-        return np.mean([rewards.sum() for _, _, rewards in episodes])
-
+    optimum = probe.optimum()
     for seed in (0, 1):
         config = override(LEARN, {"seed": seed})
-        before = real_return(algorithm.init(config).policy)
+        before = probe.real_return(algorithm.init(config).policy)
         state = training.train(config)
-        after = real_return(state.policy)
+        after = probe.real_return(state.policy)
         assert state.real_steps == 600
         assert before < 4 * optimum
         assert 1.04 * optimum <= after <= optimum * 0.9999

@@ -20,7 +20,6 @@ from metrpo.config import Config
 from metrpo.policy.gaussian import Policy
 from metrpo.presets import override
 from metrpo.run.progress import Progress
-from metrpo.world import registry
 
 BASE = override(
     Config(task="Probe", evaluation_episodes=10),
@@ -45,9 +44,7 @@ SVG = override(
 
 @pytest.fixture(autouse=True)
 def _probe_is_a_task():
-    with pytest.MonkeyPatch.context() as patch:
-        for task in (probe.PROBE, probe.ENDING_PROBE):
-            patch.setitem(registry._TASKS, task.name, task)
+    with probe.registered():
         yield
 
 
@@ -57,18 +54,6 @@ class Rows(Progress):
 
     def end(self, row, seconds_left=None):
         self.rows.append(row)
-
-
-def optimum():
-    p, _ = probe.riccati()
-    return np.mean([-s @ p @ s for s in probe.starts(30)])
-
-
-def real_return(policy):
-    """Of the mean action, from the starts of `optimum`."""
-    host = jax.tree.map(np.asarray, policy)
-    episodes = [probe.rollout(probe.PROBE, n, lambda _, s: slow_mean(host, s)) for n in range(30)]
-    return np.mean([rewards.sum() for _, _, rewards in episodes])
 
 
 # ---------------------------------------------------------------- rollouts of the policy
@@ -109,8 +94,8 @@ def test_trpo_finds_the_optimum_of_the_probe_in_the_real_environment():
     state = training.train(TRPO, None, told)
     assert state.real_steps == 30 * 400
     last = told.rows[-1]
-    assert real_return(training.init(TRPO).policy) < 3 * optimum()
-    assert 1.25 * optimum() < real_return(state.policy) < optimum()
+    assert probe.real_return(training.init(TRPO).policy) < 3 * probe.optimum()
+    assert 1.25 * probe.optimum() < probe.real_return(state.policy) < probe.optimum()
     assert all(0 < row["kl"] <= 0.05 for row in told.rows if not row["rejected_steps"])
     assert last["mean_std"] < 0.3, "less noise earns more"
     assert [row["iteration"] for row in told.rows] == list(range(1, 31))
@@ -291,6 +276,6 @@ def test_the_value_network_learns_the_returns_to_go():
 def test_svg_inf_learns_the_probe():
     told = Rows()
     state = training.train(SVG, None, told)
-    assert real_return(training.init(SVG).policy) < 3 * optimum()
-    assert 1.1 * optimum() < real_return(state.policy) < optimum()
+    assert probe.real_return(training.init(SVG).policy) < 3 * probe.optimum()
+    assert 1.1 * probe.optimum() < probe.real_return(state.policy) < probe.optimum()
     assert told.rows[-1]["train_loss"] < 0.1 * told.rows[0]["train_loss"]

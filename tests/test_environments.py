@@ -17,7 +17,6 @@ from metrpo import algorithm, phase, training
 from metrpo.config import CollectConfig, Config
 from metrpo.errors import ConfigError, TaskError
 from metrpo.model.imagine import SAMPLINGS, imagine, outcome, returns_per_model
-from metrpo.policy import gaussian
 from metrpo.presets import override, preset
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
@@ -258,7 +257,7 @@ def test_a_step_after_the_end_is_refused():
 # ---------------------------------------------------------------- formulas against the environment
 
 
-def pendulum(reward=None, terminated=None):
+def pendulum(reward=None, terminated="learned"):
     return task_of("Pendulum-v1", reward, terminated)
 
 
@@ -322,10 +321,10 @@ def test_tasks_with_known_formulas_use_them_unless_told_to_learn(name, sizes, le
     assert (task.state_size, task.action_size, task.horizon) == sizes
     assert task.learned == learned
     assert callable(task.terminated) == (name == "InvertedPendulum-v5")
-    blind = algorithm.task_of(Config(task=name, learn_reward=True))
+    blind = algorithm.task_for(Config(task=name, learn_reward=True))
     assert blind.learned == ("reward", "end")
-    assert blind is algorithm.task_of(Config(task=name, learn_reward=True)), "another object would be compiled anew"
-    assert algorithm.task_of(Config(task=name)) is task
+    assert blind is algorithm.task_for(Config(task=name, learn_reward=True)), "another object would be compiled anew"
+    assert algorithm.task_for(Config(task=name)) is task
 
 
 def test_the_first_state_has_outputs_for_what_is_learned():
@@ -430,22 +429,7 @@ def test_every_sampling_carries_the_learned_outputs_along(sampling):
 
 LEARN = override(
     Config(task="Blind", iterations=3, evaluation_episodes=20),
-    {
-        "collect.steps": 300,
-        "collect.max_train": 1000,
-        "collect.max_validation": 500,
-        "ensemble.members": 3,
-        "ensemble.hidden": (32,),
-        "fit.batch_size": 50,
-        "fit.learning_rate": 0.01,
-        "fit.max_passes": 150,
-        "imagine.steps": 2000,
-        "policy.hidden": (8,),
-        "policy.initial_std": 0.5,
-        "trpo.max_kl": 0.03,
-        "validate.max_updates": 60,
-        "validate.starts": 50,
-    },
+    {**probe.LEARN, "collect.steps": 300, "ensemble.hidden": (32,), "fit.max_passes": 150},
 )
 
 
@@ -459,16 +443,9 @@ def blind(monkeypatch):
 
 def test_the_probe_is_learned_without_knowing_its_reward(blind):
     """From 900 real steps to a loss of 1.2 times the Riccati loss when measured; the first policy loses several."""
-    p, _ = probe.riccati()
-    optimum = np.mean([-s @ p @ s for s in probe.starts(30)])
-
-    def real_return(policy):
-        host = jax.tree.map(np.asarray, policy)
-        episodes = [probe.rollout(probe.PROBE, n, lambda _, s: gaussian.mean(host, s)) for n in range(30)]
-        return np.mean([rewards.sum() for _, _, rewards in episodes])
-
-    before = real_return(training.init(LEARN).policy)
-    after = real_return(training.train(LEARN).policy)
+    optimum = probe.optimum()
+    before = probe.real_return(training.init(LEARN).policy)
+    after = probe.real_return(training.train(LEARN).policy)
     assert before < 4 * optimum
     assert 1.4 * optimum <= after <= optimum * 0.9999
 
@@ -505,8 +482,6 @@ def test_short_imagined_episodes_start_anywhere_and_are_more(blind, monkeypatch)
 
 def test_the_probe_is_learned_in_episodes_of_five_steps(blind):
     """A fourth of its horizon: what follows the cut comes from the baseline."""
-    p, _ = probe.riccati()
-    optimum = np.mean([-s @ p @ s for s in probe.starts(30)])
-    policy = jax.tree.map(np.asarray, training.train(override(LEARN, SHORT)).policy)
-    episodes = [probe.rollout(probe.PROBE, n, lambda _, s: gaussian.mean(policy, s)) for n in range(30)]
-    assert 1.5 * optimum <= np.mean([rewards.sum() for _, _, rewards in episodes]) <= optimum * 0.9999
+    optimum = probe.optimum()
+    after = probe.real_return(training.train(override(LEARN, SHORT)).policy)
+    assert 1.5 * optimum <= after <= optimum * 0.9999

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 
@@ -12,16 +11,15 @@ import probe
 from metrpo import algorithm, training
 from metrpo.config import Config
 from metrpo.errors import ConfigError, TaskError
-from metrpo.policy import gaussian
 from metrpo.presets import override
 from metrpo.world import collect as real
-from metrpo.world import logged, registry
+from metrpo.world import logged
 
 
 @pytest.fixture(autouse=True)
-def _probe_is_a_task(monkeypatch):
-    for task in (probe.PROBE, probe.ENDING_PROBE):
-        monkeypatch.setitem(registry._TASKS, task.name, task)
+def _probe_is_a_task():
+    with probe.registered():
+        yield
 
 
 def random_episodes(task=probe.PROBE, steps=600):
@@ -91,21 +89,7 @@ def test_a_file_that_is_no_archive_is_refused(tmp_path, content):
 
 OFFLINE = override(
     Config(task="Probe", evaluation_episodes=5, iterations=2, real_steps=0),
-    {
-        "collect.max_train": 1000,
-        "collect.max_validation": 500,
-        "ensemble.members": 3,
-        "ensemble.hidden": (16,),
-        "fit.batch_size": 50,
-        "fit.learning_rate": 0.01,
-        "fit.max_passes": 100,
-        "imagine.steps": 2000,
-        "policy.hidden": (8,),
-        "policy.initial_std": 0.5,
-        "trpo.max_kl": 0.03,
-        "validate.max_updates": 60,
-        "validate.starts": 50,
-    },
+    probe.LEARN,
 )
 
 
@@ -118,11 +102,8 @@ def test_the_probe_is_learned_from_logs_alone(tmp_path, monkeypatch):
     monkeypatch.undo()
     assert (state.iteration, state.real_steps) == (2, 0)
     assert state.dataset.train.size + state.dataset.validation.size == 600
-    p, _ = probe.riccati()
-    optimum = np.mean([-s @ p @ s for s in probe.starts(30)])
-    policy = jax.tree.map(np.asarray, state.policy)
-    episodes = [probe.rollout(probe.PROBE, n, lambda _, s: gaussian.mean(policy, s)) for n in range(30)]
-    assert 1.1 * optimum <= np.mean([rewards.sum() for _, _, rewards in episodes]) <= optimum * 0.9999
+    optimum = probe.optimum()
+    assert 1.1 * optimum <= probe.real_return(state.policy) <= optimum * 0.9999
 
 
 def test_logs_are_a_start_that_real_steps_add_to(tmp_path):

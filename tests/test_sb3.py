@@ -27,7 +27,6 @@ from metrpo.run.policy_file import load_policy, save_policy
 from metrpo.run.progress import Progress
 from metrpo.run.report import draw_curve
 from metrpo.seeds import Stage
-from metrpo.world import registry
 
 TINY = override(
     Config(task="Probe", iterations=3, evaluation_episodes=2),
@@ -38,9 +37,7 @@ METHODS = pytest.mark.parametrize("method", ["ppo", "ddpg"])
 
 @pytest.fixture(scope="module", autouse=True)
 def _probe_is_a_task():
-    with pytest.MonkeyPatch.context() as patch:
-        for task in (probe.PROBE, probe.ENDING_PROBE):
-            patch.setitem(registry._TASKS, task.name, task)
+    with probe.registered():
         yield
 
 

@@ -67,7 +67,7 @@ def init(config: Config) -> State:
 
     Raises `TaskError` for an unknown task, `ConfigError` for settings that contradict each other.
     """
-    task = task_of(config)
+    task = task_for(config)
     if config.imagine.horizon is not None and config.advantage.discount == 1:
         # Undiscounted, a value that leans on itself grows without bound.
         raise ConfigError("advantage.discount: expected less than 1 with imagine.horizon (0.99, say), got 1.0")
@@ -88,7 +88,7 @@ def init(config: Config) -> State:
 
 def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
     """One outer iteration: collect, fit, improve until the ensemble disagrees; and evaluate, for the record only."""
-    task = task_of(config)
+    task = task_for(config)
     iteration = state.iteration + 1
     clock = Clock()
     with clock("collect"):
@@ -98,9 +98,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
         mean = partial(_perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise)
         explorer = lambda rng: real.explore(mean(rng), config.collect, rng)  # noqa: E731
         episodes = real.collect(task, explorer, wanted, rng, progress.update)
-        dataset = (
-            datasets.add(state.dataset, episodes, config.collect, rng, task.learned) if episodes else state.dataset
-        )
+        dataset = datasets.add(state.dataset, episodes, config.collect, rng, task.learned)
     with clock("fit"):
         progress.stage("fit", None)
         ensemble, fitted = _fit(config, task, state.networks, dataset, iteration, progress)
@@ -182,7 +180,7 @@ def _logged(config: Config, task: Task) -> Dataset:
     return datasets.add(nothing, logged.load(config.data, task), config.collect, rng, task.learned)
 
 
-def task_of(config: Config) -> Task:
+def task_for(config: Config) -> Task:
     """The config's task, its formulas left out where they are to be learned."""
     task = get_task(config.task)
     return without_formulas(task) if config.learn_reward else task

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from metrpo.algorithm import Row, evaluate
+from metrpo.algorithm import Row, evaluate, task_for
 from metrpo.baselines import on_policy
 from metrpo.config import Config
 from metrpo.errors import ConfigError
@@ -32,7 +32,6 @@ from metrpo.run.progress import SILENT, Progress
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.types import Array, Episode, Normaliser, Transitions
 from metrpo.world import dataset as datasets
-from metrpo.world.registry import get_task
 from metrpo.world.task import Task
 
 _VALUE_HIDDEN = (64, 64)
@@ -68,7 +67,7 @@ class Path(NamedTuple):
 
 def init(config: Config) -> State:
     """The state before the first iteration."""
-    task, p, e = get_task(config.task), config.policy, config.ensemble
+    task, p, e = task_for(config), config.policy, config.ensemble
     if task.reward is None:
         raise ConfigError(f"method: svg needs the reward of {task.name} as a formula, got a task that learns it")
     keys = jax.random.split(key_of(config.seed, 0, Stage.INIT), 3)
@@ -90,7 +89,7 @@ def init(config: Config) -> State:
 
 def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
     """Episodes of `config.collect.steps` real steps together, each followed by training the model and the policy."""
-    task, iteration, clock = get_task(config.task), state.iteration + 1, Clock()
+    task, iteration, clock = task_for(config), state.iteration + 1, Clock()
     rng, key = rng_of(config.seed, iteration, Stage.COLLECT), key_of(config.seed, iteration, Stage.IMPROVE)
     collected: list[Episode] = []
     losses, norms, finite = [], [], []

@@ -42,9 +42,10 @@ def curves_of(figure: str, runs: Sequence[Run], out: Path) -> list[Curves]:
     found = []
     for task in FIGURES[figure].tasks:
         for label, system in FIGURES[figure].systems.items():
-            begun = [r for r in runs if (r.task, r.system) == (task, system) and rows_of(r, out)]
+            measured = {r: rows_of(r, out) for r in runs if (r.task, r.system) == (task, system)}
+            begun = {r: rows for r, rows in measured.items() if rows}
             if begun:
-                found.append(Curves(task, label, begun, [rows_of(r, out) for r in begun]))
+                found.append(Curves(task, label, list(begun), list(begun.values())))
     return found
 
 

@@ -104,10 +104,12 @@ def model_mean_std(ensemble: Ensemble, states: Array, actions: Array, keys: Keys
 
 
 def _of_all_models(ensemble: Ensemble, states: Array, actions: Array) -> Array:
-    def all_models(x: Array) -> Array:
-        return jnp.broadcast_to(x, (ensemble.members, *x.shape))
+    return predict(ensemble, *(_for_all(ensemble, x) for x in (states, actions)))
 
-    return predict(ensemble, all_models(states), all_models(actions))
+
+def _for_all(ensemble: Ensemble, x: Array) -> Array:
+    """[N, ...] -> [K, N, ...], the same for every model."""
+    return jnp.broadcast_to(x, (ensemble.members, *x.shape))
 
 
 SAMPLINGS: dict[str, Callable[[Ensemble, Array, Array, Keys], Array]] = {
@@ -138,11 +140,8 @@ def outcome(
 def disagreement(ensemble: Ensemble, states: Array, actions: Array) -> Array:
     """How far the models' predictions spread, [N, S], [N, A] -> [N]: their standard deviation, in units of each
     dimension's std in the data, mean over the dimensions (the paper's section "Discussion": a reason to explore)."""
-
-    def all_models(x: Array) -> Array:
-        return jnp.broadcast_to(x, (ensemble.members, *x.shape))
-
-    deltas = predict_delta(ensemble, all_models(states), all_models(actions)) / ensemble.normaliser.delta_std
+    deltas = predict_delta(ensemble, *(_for_all(ensemble, x) for x in (states, actions)))
+    deltas = deltas / ensemble.normaliser.delta_std
     return jnp.mean(jnp.std(deltas, axis=0), axis=-1)
 
 
@@ -228,7 +227,7 @@ def returns_per_model(
             alive = alive * (1.0 - ended)
         return (following, alive, total), None
 
-    states = jnp.broadcast_to(starts, (ensemble.members, *starts.shape))
+    states = _for_all(ensemble, starts)
     zeros = jnp.zeros(states.shape[:2])
     (_, _, total), _ = jax.lax.scan(step, (states, zeros + 1.0, zeros), None, length=horizon)
     return jnp.mean(total, axis=1)

@@ -24,7 +24,10 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     def __init__(self, env: gymnasium.Env[Any, Any], name: str, horizon: int | None = None) -> None:
         self._env, self._name, self._horizon, self._steps = env, name, horizon, 0
         self.metadata, self.render_mode = env.metadata, env.render_mode
-        actions = self._box(env.action_space, "action_space")
+        actions = env.action_space
+        if not (isinstance(actions, Box) and np.issubdtype(actions.dtype, np.floating)):
+            advice = "metrpo learns continuous control; discretised actions can be made continuous by a wrapper"
+            raise self._broken("action_space", "a Box of floats", actions, advice)
         if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
             raise self._broken(
                 "action_space",
@@ -43,12 +46,6 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         self.observation_space = Box(-np.inf, np.inf, (self._size,), np.float64)
         self.action_space = Box(-1.0, 1.0, (self.action_size,), np.float32)
         self._over = True
-
-    def _box(self, space: Any, what: str) -> Box:
-        if isinstance(space, Box) and np.issubdtype(space.dtype, np.floating):
-            return space
-        advice = "metrpo learns continuous control; discretised actions can be made continuous by a wrapper"
-        raise self._broken(what, "a Box of floats", space, advice)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -58,7 +58,7 @@ def without_formulas(task: Task) -> Task:
 @cache
 def _with_formulas(name: str) -> Task:
     known = KNOWN[name]
-    task = task_of(
+    return task_of(
         known.make,
         known.reward,
         known.terminated,
@@ -66,4 +66,3 @@ def _with_formulas(name: str) -> Task:
         unseen=known.unseen,
         description=known.description,
     )
-    return task if known.terminated else dataclasses.replace(task, terminated=None)

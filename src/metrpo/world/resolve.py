@@ -28,7 +28,7 @@ Terminated = Callable[[Array], Array]
 def task_of(
     env: str | MakeEnv,
     reward: Reward | None = None,
-    terminated: Terminated | None = None,
+    terminated: Terminated | Literal["learned"] | None = "learned",
     *,
     name: str | None = None,
     horizon: int | None = None,
@@ -38,8 +38,8 @@ def task_of(
     """A task out of an environment: its Gymnasium id, or a function that makes it (`render_mode=...` may be passed).
 
     `reward(s, a, s')` [..., S], [..., A], [..., S] -> [...] and `terminated(s')` [..., S] -> [...] are formulas for
-    NumPy and JAX arrays, with actions in [-1, 1]; what is not given is learned from the data. The horizon is the
-    environment's time limit unless `horizon` is given.
+    NumPy and JAX arrays, with actions in [-1, 1]; what is not given is learned from the data. With `terminated=None`
+    nothing but the clock ends an episode. The horizon is the environment's time limit unless `horizon` is given.
 
     Raises `TaskError` when the environment cannot be made, breaks its promise in its first step, or has no time limit.
     """
@@ -57,8 +57,7 @@ def task_of(
             f"{called}: expected an environment with a time limit, got none: register it with max_episode_steps, wrap "
             "it in gymnasium.wrappers.TimeLimit, or give metrpo.task_of(..., horizon=...)"
         )
-    ends: Terminated | Literal["learned"] = terminated or "learned"
-    return Task(called, called, len(state), actions, limit, reward, ends, unseen, description, make)
+    return Task(called, called, len(state), actions, limit, reward, terminated, unseen, description, make)
 
 
 def _make(env: str | MakeEnv, name: str, horizon: int | None, **kwargs: Any) -> Guarded:
