@@ -156,17 +156,34 @@ class PolicyConfig:
 class AdvantageConfig:
     """Advantages and their baseline (authors' settings: no discount, lambda 1, linear features)."""
 
+    baseline: Literal["linear", "network"] = "linear"
+    """What values a state: linear features, fitted afresh to every batch, or a network that goes on learning."""
+
     discount: float = 1.0
     """gamma."""
     gae_lambda: float = 1.0
     """lambda of generalised advantage estimation."""
     ridge: float = 1e-5
     """Ridge penalty of the linear-feature baseline."""
+    value_hidden: tuple[int, ...] = (64, 64)
+    """Sizes of the value network's hidden layers (tanh)."""
+    value_steps: int = 40
+    """Minibatches that the value network learns from after every policy update."""
+    value_batch_size: int = 1000
+    """Imagined steps per minibatch of the value network."""
+    value_learning_rate: float = 1e-3
+    """Adam's step size for the value network."""
 
     def __post_init__(self) -> None:
         _require(0 <= self.discount <= 1, "advantage.discount", self.discount, "between 0 and 1")
         _require(0 <= self.gae_lambda <= 1, "advantage.gae_lambda", self.gae_lambda, "between 0 and 1")
         _require(_positive(self.ridge), "advantage.ridge", self.ridge, "a finite number > 0")
+        hidden = self.value_hidden
+        _require(all(n >= 1 for n in hidden), "advantage.value_hidden", hidden, "sizes of at least 1")
+        for name in ("value_steps", "value_batch_size"):
+            _require(getattr(self, name) >= 1, f"advantage.{name}", getattr(self, name), "at least 1")
+        rate = self.value_learning_rate
+        _require(_positive(rate), "advantage.value_learning_rate", rate, "a finite number > 0")
 
 
 @dataclass(frozen=True)
@@ -299,6 +316,9 @@ System = Literal[
 ]
 """Names of the systems that the paper compares."""
 
+Preset = Literal["fast", "paper", "long-horizon"]
+"""Names of the presets (see `metrpo.presets`)."""
+
 
 @dataclass(frozen=True)
 class Config:
@@ -306,7 +326,7 @@ class Config:
 
     task: str
     """Name of a registered task (see `metrpo tasks`)."""
-    preset: Literal["fast", "paper"] = "fast"
+    preset: Preset = "fast"
     """The preset that the values came from; a label, the values themselves count."""
     seed: int = 0
     """All randomness derives from it."""
@@ -361,6 +381,11 @@ ADDED = (
     "config.imagine.horizon",
     "config.imagine.products",
     "config.imagine.disagreement",
+    "config.advantage.baseline",
+    "config.advantage.value_hidden",
+    "config.advantage.value_steps",
+    "config.advantage.value_batch_size",
+    "config.advantage.value_learning_rate",
     "config.trpo.fisher_every",
     "config.system",
     "config.method",

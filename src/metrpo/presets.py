@@ -2,16 +2,16 @@
 
 `paper` holds the paper's values (its appendix A.1) and, where it is silent, its authors' settings; the citations stand
 in `tests/test_presets.py`, which holds every value against them. `fast` reaches the same return soonest on two CPU
-cores; how its values were chosen is in `docs/fast-preset.md`.
+cores; how its values were chosen is in `docs/fast-preset.md`. `long-horizon` is for tasks of 1,000 steps.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import typing
-from typing import Any, Literal, cast
+from typing import Any, cast
 
-from metrpo.config import Config, convert
+from metrpo.config import Config, Preset, convert
 from metrpo.errors import ConfigError
 from metrpo.systems import PAPER as SYSTEMS_PAPER
 from metrpo.systems import SYSTEMS, Overrides
@@ -71,6 +71,16 @@ FAST: dict[str, Overrides] = {
     },
 }
 
+LONG_HORIZON_ALL: Overrides = {
+    "advantage.baseline": "network",
+    "advantage.discount": 0.99,
+    "advantage.gae_lambda": 0.95,
+    "imagine.horizon": 30,
+    "imagine.start": "anywhere",
+    "policy.initial_std": 0.5,
+}
+"""On top of `fast`, for tasks of 1,000 steps: short imagined episodes from anywhere, valued where they are cut."""
+
 SAME_AS = {"HopperUpright": "Hopper", "HumanoidStandup": "Humanoid"}
 """Variants share their task's row."""
 
@@ -80,15 +90,17 @@ def preset(task: str, name: str = "fast", system: str = "me-trpo", **top_level: 
 
     Raises `ConfigError` for an unknown preset, system or setting.
     """
-    if name not in ("fast", "paper"):
-        raise ConfigError(f"preset: expected fast or paper, got {name!r}")
+    if name not in typing.get_args(Preset):
+        raise ConfigError(f"preset: expected one of {', '.join(typing.get_args(Preset))}, got {name!r}")
     row = SAME_AS.get(task, task)
     own = {} if row in PAPER else _generic(task)
     overrides = (PAPER.get(row, {}) if name == "paper" else FAST_ALL | FAST.get(row, {})) | own
+    if name == "long-horizon":
+        overrides = overrides | LONG_HORIZON_ALL
     if system not in SYSTEMS:
         raise ConfigError(f"system: expected one of {', '.join(SYSTEMS)}, got {system!r}")
     overrides = overrides | SYSTEMS[system] | (SYSTEMS_PAPER.get(system, {}) if name == "paper" else {})
-    config = Config(task=task, preset=cast(Literal["fast", "paper"], name))
+    config = Config(task=task, preset=cast(Preset, name))
     return override(config, overrides | {"system": system} | top_level)
 
 

@@ -15,10 +15,10 @@ from metrpo.algorithm import Row, evaluate
 from metrpo.baselines import on_policy
 from metrpo.baselines.on_policy import Drawn
 from metrpo.config import Config
-from metrpo.policy import advantage, gaussian, trpo
+from metrpo.policy import gaussian, trpo
 from metrpo.policy.batch import ImproveInfo
 from metrpo.policy.gaussian import Policy
-from metrpo.policy.improve import batch_of
+from metrpo.policy.improve import Baseline, batch_of, init_baseline
 from metrpo.run.clock import Clock
 from metrpo.run.progress import SILENT, Progress
 from metrpo.seeds import Stage, key_of, rng_of
@@ -35,7 +35,7 @@ class State(NamedTuple):
     iteration: int
     real_steps: int
     policy: Policy
-    baseline: Array
+    baseline: Baseline
 
 
 def init(config: Config) -> State:
@@ -43,7 +43,7 @@ def init(config: Config) -> State:
     task, p = get_task(config.task), config.policy
     key = key_of(config.seed, 0, Stage.INIT)
     policy = gaussian.init(key, task.state_size, task.action_size, p.hidden, p.initial_std)
-    return State(0, 0, policy, advantage.init_baseline(task.state_size))
+    return State(0, 0, policy, init_baseline(config, task.state_size, key_of(config.seed, 0, Stage.IMPROVE)))
 
 
 def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
@@ -58,7 +58,8 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
         # Other settings, the seed say, must not cause a compilation.
         relevant = Config(task=task.name, advantage=config.advantage, trpo=config.trpo)
         batch = trajectories(drawn, task.horizon)
-        policy, baseline, info = jax.device_get(_update(relevant, state.policy, state.baseline, batch))
+        key = key_of(config.seed, iteration, Stage.IMPROVE)
+        policy, baseline, info = jax.device_get(_update(relevant, state.policy, state.baseline, batch, key))
     with clock("evaluate"):
         progress.stage("evaluate", config.evaluation_episodes)
         returns = evaluate(config, task, policy, iteration)
@@ -98,8 +99,8 @@ def trajectories(drawn: Drawn, horizon: int) -> Trajectories:
 
 @partial(jax.jit, static_argnames="config")
 def _update(
-    config: Config, policy: Policy, baseline: Array, rollouts: Trajectories
-) -> tuple[Policy, Array, ImproveInfo]:
-    batch, baseline = batch_of(config, rollouts, baseline)
+    config: Config, policy: Policy, baseline: Baseline, rollouts: Trajectories, key: Array
+) -> tuple[Policy, Baseline, ImproveInfo]:
+    batch, baseline = batch_of(config, rollouts, baseline, key)
     policy, info = trpo.improve(policy, batch, config.trpo)
     return policy, baseline, info

@@ -15,24 +15,27 @@ import jax
 import jax.numpy as jnp
 
 from metrpo.config import Config
-from metrpo.policy import advantage, bptt, gaussian, ppo, trpo, vpg
+from metrpo.policy import advantage, bptt, gaussian, ppo, trpo, value, vpg
 from metrpo.policy.ascent import init_moments
 from metrpo.policy.batch import Batch, ImproveInfo
 from metrpo.policy.gaussian import Policy
 from metrpo.types import Act, Array, Simulate, Trajectories
 
+Baseline = Any
+"""Weights of the linear baseline [2S + 4], or a `value.Value`: `config.advantage.baseline` decides."""
+
 
 class Memory(NamedTuple):
     """What an improver keeps from update to update."""
 
-    baseline: Array
-    """Weights of the linear baseline, fitted to the last batch."""
+    baseline: Baseline
+    """What values a state, fitted to the last batch."""
     moments: Any
     """Adam's; of improvers other than TRPO."""
 
 
-_SHUFFLE = 2**31 - 1
-"""Derives a key that is none of the devices' (`metrpo.devices.share_of`)."""
+_SHUFFLE, _VALUE = 2**31 - 1, 2**31 - 2
+"""Derive keys that are none of the devices' (`metrpo.devices.share_of`)."""
 Infos = tuple[ImproveInfo, Any]
 """Of the update, and of the rollouts it learned from."""
 Improver = Callable[[Config, Simulate, Policy, Memory, Array, Array, str | None], tuple[Policy, Memory, Infos]]
@@ -40,17 +43,32 @@ Step = Callable[[Config, Policy, Any, Batch, Array, str | None], tuple[Policy, A
 """(config, policy, moments, batch, key, axis) -> (policy, moments, info): a step of a score-function improver."""
 
 
-def init_memory(config: Config, policy: Policy, baseline: Array) -> Memory:
+def init_baseline(config: Config, state_size: int, key: Array) -> Baseline:
+    """A baseline that predicts 0 everywhere."""
+    if config.advantage.baseline == "network":
+        return value.init(key, state_size, config.advantage)
+    return advantage.init_baseline(state_size)
+
+
+def init_memory(config: Config, policy: Policy, baseline: Baseline) -> Memory:
     """The memory at the start of a policy phase: the baseline goes on, Adam starts afresh."""
     return Memory(baseline, () if config.improver == "trpo" else init_moments(policy, config.gradient))
 
 
-def batch_of(config: Config, rollouts: Trajectories, baseline: Array, axis: str | None = None) -> tuple[Batch, Array]:
-    """The rollouts [T, N] as a batch of T N steps with their advantages under `baseline`; and the baseline refitted."""
-    a = config.advantage
-    advantages, baseline = advantage.advantages_and_baseline(
-        rollouts, baseline, a.discount, a.gae_lambda, a.ridge, axis, cut=config.imagine.horizon is not None
-    )
+def batch_of(
+    config: Config, rollouts: Trajectories, baseline: Baseline, key: Array, axis: str | None = None
+) -> tuple[Batch, Baseline]:
+    """The rollouts [T, N] as a batch of T N steps with their advantages under `baseline`; and the baseline refitted.
+
+    `key` is for the baseline that is fitted to minibatches.
+    """
+    a, cut = config.advantage, config.imagine.horizon is not None
+    if a.baseline == "network":
+        advantages, baseline = value.advantages_and_value(rollouts, baseline, a, key, axis, cut)
+    else:
+        advantages, baseline = advantage.advantages_and_baseline(
+            rollouts, baseline, a.discount, a.gae_lambda, a.ridge, axis, cut
+        )
     batch = Batch(rollouts.states, rollouts.actions, advantages, rollouts.mask)
     # Episode by episode: every n-th step is then one of every episode, whatever their number.
     return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), batch), baseline
@@ -63,7 +81,7 @@ def _by_score_function(step: Step) -> Improver:
         config: Config, simulate: Simulate, policy: Policy, memory: Memory, starts: Array, key: Array, axis: str | None
     ) -> tuple[Policy, Memory, Infos]:
         rollouts, imagined = simulate(partial(gaussian.sample, policy), starts, key)
-        batch, baseline = batch_of(config, rollouts, memory.baseline, axis)
+        batch, baseline = batch_of(config, rollouts, memory.baseline, jax.random.fold_in(key, _VALUE), axis)
         policy, moments, improved = step(config, policy, memory.moments, batch, jax.random.fold_in(key, _SHUFFLE), axis)
         return policy, Memory(baseline, moments), (improved, imagined)
 
