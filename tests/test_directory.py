@@ -289,7 +289,11 @@ def cut(path: Path) -> None:
             lambda p: p.write_text(p.read_text().replace('"members": 5', '"members": 0')),
             "ensemble.members",
         ),
-        ("checkpoints/iteration-00002.npz", cut, r"00002.npz is damaged.*Nothing was changed.*delete .*00002.npz"),
+        (
+            "checkpoints",
+            lambda p: [cut(f) for f in p.iterdir()],
+            r"00002.npz is damaged.* and .*00001.npz is damaged.*Nothing was changed.*no earlier checkpoint",
+        ),
         (
             "checkpoints",
             lambda p: [f.unlink() for f in p.iterdir()],
@@ -306,14 +310,15 @@ def test_a_damaged_directory_is_refused_and_left_alone(tmp_path, name, damage, m
     assert contents(tmp_path) == before
 
 
-def test_following_the_advice_goes_on_from_the_previous_checkpoint(tmp_path):
+def test_a_damaged_checkpoint_costs_its_iteration_only(tmp_path, caplog):
     train(tmp_path, until=3)
     newest = tmp_path / "checkpoints" / "iteration-00003.npz"
     cut(newest)
-    with pytest.raises(RunDirectoryError, match=r"To go on from iteration-00002\.npz, delete"):
-        train(tmp_path)
-    newest.unlink()
+    damaged = newest.read_bytes()
     assert train(tmp_path, until=4) == [3, 4]
+    assert "iteration-00003.npz is damaged" in caplog.text
+    assert "going on from iteration-00002.npz" in caplog.text
+    assert newest.with_name("iteration-00003.npz.damaged").read_bytes() == damaged, "nothing is thrown away"
     assert [row["iteration"] for row in read_metrics(tmp_path / "metrics.csv")] == [1, 2, 3, 4]
 
 

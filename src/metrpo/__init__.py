@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from metrpo.algorithm import State
     from metrpo.evaluation import EvaluationResult, evaluate, render
     from metrpo.presets import preset
+    from metrpo.run.episodes import append_episode
     from metrpo.run.metrics import read_metrics
     from metrpo.run.policy_file import LoadedPolicy, load_policy
     from metrpo.training import init, step, train
@@ -37,6 +38,7 @@ __all__ = [
     "State",
     "Task",
     "TaskError",
+    "append_episode",
     "evaluate",
     "get_task",
     "init",
@@ -55,6 +57,7 @@ _HOME = {
     "metrpo.algorithm": ("State",),
     "metrpo.evaluation": ("EvaluationResult", "evaluate", "render"),
     "metrpo.presets": ("preset",),
+    "metrpo.run.episodes": ("append_episode",),
     "metrpo.run.metrics": ("read_metrics",),
     "metrpo.run.policy_file": ("LoadedPolicy", "load_policy"),
     "metrpo.training": ("init", "step", "train"),

@@ -15,9 +15,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from contextlib import closing
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import numpy as np
@@ -29,12 +31,13 @@ from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Ensemble, Networks
 from metrpo.model.fit import FitInfo, fit
 from metrpo.phase import PhaseInfo
-from metrpo.policy import advantage, gaussian
+from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
+from metrpo.policy.improve import Baseline, init_baseline
 from metrpo.run.clock import Clock
 from metrpo.run.progress import SILENT, Progress
 from metrpo.seeds import Stage, key_of, rng_of
-from metrpo.types import Array
+from metrpo.types import Array, Episode
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
 from metrpo.world import logged
@@ -58,7 +61,7 @@ class State(NamedTuple):
     """The policy before the last policy phase that changed it; scales the parameter noise."""
     networks: Networks
     """Of the ensemble; its normaliser derives from the dataset."""
-    baseline: Array
+    baseline: Baseline
     dataset: Dataset
 
 
@@ -71,6 +74,10 @@ def init(config: Config) -> State:
     if config.imagine.horizon is not None and config.advantage.discount == 1:
         # Undiscounted, a value that leans on itself grows without bound.
         raise ConfigError("advantage.discount: expected less than 1 with imagine.horizon (0.99, say), got 1.0")
+    if not task.playable and (config.validate.rule == "real" or config.imagine.start == "reset"):
+        raise ConfigError(
+            f"{task.name}: expected an environment for validate.rule real and imagine.start reset, got none"
+        )
     policy_key, ensemble_key = jax.random.split(key_of(config.seed, 0, Stage.INIT))
     policy = gaussian.init(
         policy_key, task.state_size, task.action_size, config.policy.hidden, config.policy.initial_std
@@ -81,24 +88,65 @@ def init(config: Config) -> State:
         policy=policy,
         previous_policy=policy,
         networks=_fresh_networks(config, task, ensemble_key),
-        baseline=advantage.init_baseline(task.state_size),
+        baseline=init_baseline(config, task.state_size, key_of(config.seed, 0, Stage.IMPROVE)),
         dataset=_logged(config, task),
     )
 
 
-def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
+class Log(Protocol):
+    """Where real episodes go as they end, and where those wait that nobody has learned from yet."""
+
+    def pending(self) -> list[Episode]:
+        """The episodes that wait."""
+
+    def append(self, episode: Episode) -> object:
+        """Keeps one more."""
+
+
+def step(config: Config, state: State, progress: Progress = SILENT, log: Log | None = None) -> tuple[State, Row]:
     """One outer iteration: collect, fit, improve until the ensemble disagrees; and evaluate, for the record only."""
-    task = task_for(config)
-    iteration = state.iteration + 1
     clock = Clock()
     with clock("collect"):
-        wanted = 0 if config.real_steps == 0 else config.collect.steps
-        progress.stage("collect", wanted)
-        rng = rng_of(config.seed, iteration, Stage.COLLECT)
-        mean = partial(_perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise)
-        explorer = lambda rng: real.explore(mean(rng), config.collect, rng)  # noqa: E731
-        episodes = real.collect(task, explorer, wanted, rng, progress.update)
-        dataset = datasets.add(state.dataset, episodes, config.collect, rng, task.learned)
+        episodes = collect(config, state, progress, log)
+    return learn(config, state, episodes, progress, clock)
+
+
+def collect(
+    config: Config, state: State, progress: Progress = SILENT, log: Log | None = None, at_least: int | None = None
+) -> list[Episode]:
+    """The real episodes of the next iteration: those that wait in `log`, and more until they have enough steps.
+
+    Enough are `at_least`, or as many as the config asks for. New ones go to `log` as they end; what a run that was
+    stopped has collected is not collected again.
+    """
+    enough = (0 if config.real_steps == 0 else config.collect.steps) if at_least is None else at_least
+    progress.stage("collect", enough)
+    mean = partial(_perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise)
+    explorer = lambda rng: real.explore(mean(rng), config.collect, rng)  # noqa: E731
+    episodes = [] if log is None else log.pending()
+    steps = sum(len(e.rewards) for e in episodes)
+    # Each episode has randomness of its own, so that it is the same one after any interruption.
+    numbers = itertools.count(len(episodes))
+    rngs = (rng_of(config.seed, state.iteration + 1, Stage.COLLECT, number) for number in numbers)
+    with closing(real.play(task_for(config), explorer, rngs)) as played:
+        while steps < enough:
+            episodes.append(next(played))
+            if log is not None:
+                log.append(episodes[-1])
+            steps += len(episodes[-1].rewards)
+            progress.update(steps)
+    return episodes
+
+
+def learn(
+    config: Config, state: State, episodes: list[Episode], progress: Progress = SILENT, clock: Clock | None = None
+) -> tuple[State, Row]:
+    """The rest of an outer iteration: what `episodes`, and all before them, teach."""
+    task = task_for(config)
+    iteration = state.iteration + 1
+    clock = clock or Clock()
+    rng = rng_of(config.seed, iteration, Stage.SPLIT)
+    dataset = datasets.add(state.dataset, episodes, config.collect, rng, task.learned)
     with clock("fit"):
         progress.stage("fit", None)
         ensemble, fitted = _fit(config, task, state.networks, dataset, iteration, progress)
@@ -148,7 +196,7 @@ def _improve(
     iteration: int,
     progress: Progress,
     clock: Clock,
-) -> tuple[Policy, Array, PhaseInfo]:
+) -> tuple[Policy, Baseline, PhaseInfo]:
     rng, starts = rng_of(config.seed, iteration, Stage.IMPROVE), dataset.starts
     if config.imagine.start == "anywhere":
         starts = dataset.train.states
@@ -176,7 +224,7 @@ def _logged(config: Config, task: Task) -> Dataset:
         if config.real_steps == 0:
             raise ConfigError("real_steps: expected at least 1 without logged transitions to learn from (data), got 0")
         return nothing
-    rng = rng_of(config.seed, 0, Stage.COLLECT)
+    rng = rng_of(config.seed, 0, Stage.SPLIT)
     return datasets.add(nothing, logged.load(config.data, task), config.collect, rng, task.learned)
 
 
@@ -187,7 +235,12 @@ def task_for(config: Config) -> Task:
 
 
 def evaluate(config: Config, task: Task, policy: Policy, iteration: int) -> np.ndarray:
-    """Real returns [config.evaluation_episodes] of the deterministic policy: a record, never used to learn."""
+    """Real returns [config.evaluation_episodes] of the deterministic policy: a record, never used to learn.
+
+    One NaN for a task that only another program can play.
+    """
+    if not task.playable:
+        return np.array([math.nan])
     seed = int(rng_of(config.seed, iteration, Stage.EVALUATE).integers(2**31))
     return real.evaluate(task, partial(gaussian.mean, _host(policy)), config.evaluation_episodes, seed)
 

@@ -1,4 +1,4 @@
-"""The command line: `metrpo train | evaluate | render | export | tasks | doctor | bench | reproduce`.
+"""The command line: `metrpo train`, `metrpo evaluate` and the other commands of `metrpo.options`.
 
 Whatever imports JAX or MuJoCo is imported where it is used: help must come at once, and JAX reads its environment
 variables when imported.
@@ -9,17 +9,32 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import math
 import os
 import re
 import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from metrpo.config import Config
-from metrpo.errors import MetrpoError
-from metrpo.options import Bench, Doctor, Evaluate, Export, Render, Reproduce, Tasks, Train, parse
+from metrpo.errors import MetrpoError, TaskError
+from metrpo.options import (
+    Bench,
+    Collect,
+    Doctor,
+    Evaluate,
+    Export,
+    Improve,
+    Init,
+    Render,
+    Reproduce,
+    Run,
+    Tasks,
+    Train,
+    parse,
+)
 
 
 class _Terminated(BaseException):
@@ -53,10 +68,7 @@ def _train(command: Train) -> int:
     from metrpo.run.progress import default_progress
     from metrpo.training import train
 
-    config = Config(**{f.name: getattr(command, f.name) for f in dataclasses.fields(Config)})
-    system = "" if config.system == "me-trpo" else f"{config.system}-"
-    task = re.sub(r"[^\w.-]+", "-", config.task)  # a task may be named path/to/file.py:name
-    run_dir = command.run_dir or Path("runs") / f"{task}-{system}{config.preset}-seed{config.seed}"
+    config, run_dir = _run(command)
     signal.signal(signal.SIGTERM, _terminate)
     progress = default_progress()
     try:
@@ -67,8 +79,63 @@ def _train(command: Train) -> int:
         progress.close()
         print(f"metrpo: stopped; {run_dir} keeps every finished iteration. The same command goes on.", file=sys.stderr)
         raise
+    except TaskError as error:
+        if any(run_dir.glob("checkpoints/*.npz")) or any(run_dir.glob("episodes/*.npz")):
+            kept = f"{run_dir} keeps every finished iteration and real episode. The same command goes on"
+            raise TaskError(f"{error}\nmetrpo: stopped; {kept}.") from error
+        raise
     finally:
         progress.close()
+    return 0
+
+
+def _run(command: Run) -> tuple[Config, Path]:
+    """The settings, and where the run lives."""
+    config = Config(**{f.name: getattr(command, f.name) for f in dataclasses.fields(Config)})
+    system = "" if config.system == "me-trpo" else f"{config.system}-"
+    task = re.sub(r"[^\w.-]+", "-", config.task)  # a task may be named path/to/file.py:name
+    return config, command.run_dir or Path("runs") / f"{task}-{system}{config.preset}-seed{config.seed}"
+
+
+def _init(command: Init) -> int:
+    from metrpo.run.policy_file import FILE
+    from metrpo.stepwise import begin
+
+    config, run_dir = _run(command)
+    begin(config, run_dir)
+    print(f"{run_dir / FILE} is the untrained policy; add episodes (metrpo collect {run_dir}), then")
+    print(f"metrpo improve {run_dir}")
+    return 0
+
+
+def _collect(command: Collect) -> int:
+    from metrpo.run import machine
+
+    machine.prepare(None, deterministic=False)
+    from metrpo.run.progress import SILENT, default_progress
+    from metrpo.stepwise import collect
+
+    signal.signal(signal.SIGTERM, _terminate)
+    waiting = collect(command.dir, command.steps, command.data, SILENT if command.json else default_progress())
+    found: dict[str, float] = {"episodes": len(waiting), "steps": sum(len(e.rewards) for e in waiting)}
+    found |= {"return": sum(float(e.rewards.sum()) for e in waiting) / max(len(waiting), 1)}
+    text = "{episodes} episodes of {steps:,} steps wait, mean return {return:.1f}"
+    print(json.dumps(found) if command.json else f"{text.format(**found)}; next: metrpo improve {command.dir}")
+    return 0
+
+
+def _improve(command: Improve) -> int:
+    from metrpo.run import machine
+    from metrpo.run.directory import stored_config
+
+    machine.prepare(None, stored_config(command.dir).deterministic)
+    from metrpo.run.policy_file import FILE
+    from metrpo.run.progress import SILENT, default_progress
+    from metrpo.stepwise import improve
+
+    signal.signal(signal.SIGTERM, _terminate)
+    row = improve(command.dir, SILENT if command.json else default_progress())
+    print(_json(row) if command.json else f"  policy   {command.dir / FILE}")
     return 0
 
 
@@ -185,6 +252,11 @@ def _reproduce(command: Reproduce) -> int:
     return 1 if failed else 0
 
 
+def _json(numbers: Mapping[str, float | None]) -> str:
+    """As JSON, which knows no NaN."""
+    return json.dumps({name: None if value is None or math.isnan(value) else value for name, value in numbers.items()})
+
+
 def _version() -> int:
     from metrpo.run.files import metrpo_version
 
@@ -198,6 +270,9 @@ def _terminate(*_: object) -> None:
 
 _COMMANDS: dict[type, Callable[[Any], int]] = {
     Train: _train,
+    Init: _init,
+    Collect: _collect,
+    Improve: _improve,
     Evaluate: _evaluate,
     Render: _render,
     Export: _export,

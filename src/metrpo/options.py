@@ -11,30 +11,21 @@ from typing import Annotated, Any, Literal, cast
 import tyro
 from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, arg, subcommand
 
-from metrpo.config import Config, System
+from metrpo.config import Config, Preset, System
 from metrpo.errors import ConfigError
 
 _BUDGET = tyro.conf.create_mutex_group(required=False)
 
 
 @dataclass(frozen=True)
-class Train(Config):
-    """Learn a task, or go on with a run: the same command on the same directory resumes it.
-
-    Every setting below starts from the task's preset. For example:
-        metrpo train Swimmer
-        metrpo train HalfCheetah --seed 1 --real-steps 60000 --run-dir runs/cheetah
-        metrpo train Swimmer --system ppo
-        metrpo train Swimmer --data log.npz --real-steps 0 --run-dir runs/offline
-        metrpo train Pendulum-v1                          # any Gymnasium id; reward and end are learned
-        metrpo train path/to/file.py:task                 # a task or a function that makes an environment
-        metrpo train Swimmer --preset paper --ensemble.members 10 --trpo.max-kl 0.02 --ensemble.hidden 512 512
-    """
+class Run(Config):
+    """A run's settings as they are typed."""
 
     task: Annotated[Positional[str], arg(metavar="TASK")] = "Swimmer"
     """Name of the task (see: metrpo tasks), a Gymnasium id, module:name or path/to/file.py:name."""
-    preset: Literal["fast", "paper"] = "fast"
-    """What all other settings start from: the paper's values, or what learns soonest on two CPU cores."""
+    preset: Preset = "fast"
+    """What all other settings start from: the paper's values, what learns soonest on two CPU cores, or short imagined
+    episodes valued at their end by a network, for tasks of 1,000 steps."""
     system: System = "me-trpo"
     """Which of the paper's systems: they differ from me-trpo in a few settings each (see metrpo.systems)."""
     iterations: Annotated[int, _BUDGET] = 10
@@ -47,8 +38,73 @@ class Train(Config):
     """Where the run lives; default: runs/<task>-[<system>-]<preset>-seed<seed>."""
     device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="{cpu,gpu}")] = None
     """Where JAX computes; default: a GPU if JAX can use one."""
+
+
+@dataclass(frozen=True)
+class Train(Run):
+    """Learn a task, or go on with a run: the same command on the same directory resumes it.
+
+    Every setting below starts from the task's preset. For example:
+        metrpo train Swimmer
+        metrpo train HalfCheetah --seed 1 --real-steps 60000 --run-dir runs/cheetah
+        metrpo train Swimmer --system ppo
+        metrpo train Swimmer --data log.npz --real-steps 0 --run-dir runs/offline
+        metrpo train Pendulum-v1                          # any Gymnasium id; reward and end are learned
+        metrpo train path/to/file.py:task                 # a task or a function that makes an environment
+        metrpo train Swimmer --preset paper --ensemble.members 10 --trpo.max-kl 0.02 --ensemble.hidden 512 512
+    """
+
     video: bool = True
     """Record the final policy when all is done."""
+
+
+@dataclass(frozen=True)
+class Init(Run):
+    """Start a run whose episodes another program plays: a robot's own, say. Takes the same settings as train.
+
+    It writes the untrained policy. Then, again and again: play DIR's policy, add the episodes, improve. For example:
+        metrpo init path/to/arm.py:task --run-dir runs/arm
+        metrpo collect runs/arm --data today.npz          # or metrpo.append_episode in the robot's program
+        metrpo improve runs/arm
+    """
+
+
+@dataclass(frozen=True)
+class Collect:
+    """Add real episodes to a run, which its next iteration learns from; one that was stopped goes on.
+
+    They are on disk as soon as they end. For example:
+        metrpo collect runs/arm                           # plays the task's environment with exploration
+        metrpo collect runs/arm --steps 1000
+        metrpo collect runs/arm --data today.npz          # episodes that were recorded elsewhere
+    """
+
+    dir: Annotated[Positional[Path], arg(metavar="DIR")]
+    """The run directory."""
+    steps: Annotated[int | None, arg(metavar="INT")] = None
+    """Play until the episodes that wait have so many steps; default: the run's collect.steps."""
+    data: Annotated[str | None, arg(metavar="FILE")] = None
+    """Instead: an .npz of logged transitions: states, actions, rewards, next_states, terminated."""
+    json: bool = False
+    """Print JSON."""
+
+    def __post_init__(self) -> None:
+        if self.steps is not None and self.steps < 1:
+            raise ConfigError(f"steps: expected at least 1, got {self.steps}")
+
+
+@dataclass(frozen=True)
+class Improve:
+    """Learn from the episodes that wait in a run: fit the models, improve the policy, write it. One iteration.
+
+    For example:
+        metrpo improve runs/arm
+    """
+
+    dir: Annotated[Positional[Path], arg(metavar="DIR")]
+    """The run directory."""
+    json: bool = False
+    """Print the iteration's metrics as JSON."""
 
 
 @dataclass(frozen=True)
@@ -188,7 +244,7 @@ class Reproduce:
                 raise ConfigError(f"{name}: expected at least 1, got {value}")
 
 
-Command = Train | Evaluate | Render | Export | Tasks | Doctor | Bench | Reproduce
+Command = Train | Init | Collect | Improve | Evaluate | Render | Export | Tasks | Doctor | Bench | Reproduce
 
 _DESCRIPTION = """Model-Ensemble Trust-Region Policy Optimization: control learnt from few real steps.
 
@@ -197,18 +253,19 @@ Start with: metrpo train Swimmer. It ends by naming the learning curve and the v
 
 
 def parse(arguments: list[str]) -> Command:
-    """The command as typed; for `train`, with the task's preset as the defaults.
+    """The command as typed; for `train` and `init`, with the task's preset as the defaults.
 
     Raises `SystemExit` after printing help or what is wrong, `MetrpoError` for an impossible value or an unknown task.
     """
     from metrpo.presets import preset
 
-    if arguments[0] != "train":
+    kind = {"train": Train, "init": Init}.get(arguments[0])
+    if kind is None:
         return _with_defaults(Train(), arguments)
     # Which defaults? That is among the arguments: they are read twice.
-    any_task, first = _defaults(preset("Swimmer")), None
+    any_task, first = _defaults(kind, preset("Swimmer")), None
     with contextlib.suppress(SystemExit):
-        first = cast(Train, _with_defaults(any_task, [a for a in arguments if a not in ("-h", "--help")], quiet=True))
+        first = cast(Run, _with_defaults(any_task, [a for a in arguments if a not in ("-h", "--help")], quiet=True))
     if first is None:
         return _with_defaults(any_task, arguments)
     from metrpo.run import machine
@@ -217,17 +274,20 @@ def parse(arguments: list[str]) -> Command:
     from metrpo.world.registry import get_task
 
     task = get_task(first.task).name
-    parsed = _with_defaults(_defaults(preset(task, first.preset, first.system)), arguments)
-    return dataclasses.replace(cast(Train, parsed), task=task)
+    parsed = _with_defaults(_defaults(kind, preset(task, first.preset, first.system)), arguments)
+    return cast(Command, dataclasses.replace(cast(Run, parsed), task=task))
 
 
-def _defaults(config: Config) -> Train:
-    return Train(**{f.name: getattr(config, f.name) for f in dataclasses.fields(Config)} | {"task": tyro.MISSING})
+def _defaults(kind: type[Run], config: Config) -> Run:
+    return kind(**{f.name: getattr(config, f.name) for f in dataclasses.fields(Config)} | {"task": tyro.MISSING})
 
 
-def _with_defaults(train: Train, arguments: list[str], quiet: bool = False) -> Command:
+def _with_defaults(run: Run, arguments: list[str], quiet: bool = False) -> Command:
     commands: Any = (
-        Annotated[Train, subcommand("train", default=train)]
+        Annotated[Train, subcommand("train", default=run if isinstance(run, Train) else Train())]
+        | Annotated[Init, subcommand("init", default=run if isinstance(run, Init) else Init())]
+        | Annotated[Collect, subcommand("collect")]
+        | Annotated[Improve, subcommand("improve")]
         | Annotated[Evaluate, subcommand("evaluate")]
         | Annotated[Render, subcommand("render")]
         | Annotated[Export, subcommand("export")]

@@ -13,7 +13,7 @@ from metrpo.types import Array
 class Stage(IntEnum):
     """What the randomness is for."""
 
-    INIT, COLLECT, FIT, IMPROVE, EVALUATE = range(5)
+    INIT, COLLECT, FIT, IMPROVE, EVALUATE, SPLIT = range(6)
 
 
 def key_of(seed: int, iteration: int, stage: Stage) -> Array:
@@ -21,6 +21,6 @@ def key_of(seed: int, iteration: int, stage: Stage) -> Array:
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), iteration), int(stage))
 
 
-def rng_of(seed: int, iteration: int, stage: Stage) -> np.random.Generator:
-    """A NumPy generator for a stage of an outer iteration."""
-    return np.random.default_rng([seed, iteration, int(stage)])
+def rng_of(seed: int, iteration: int, stage: Stage, number: int = 0) -> np.random.Generator:
+    """A NumPy generator for a stage of an outer iteration, or for the `number`-th thing that is done in it."""
+    return np.random.default_rng([seed, iteration, int(stage), number])

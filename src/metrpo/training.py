@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from metrpo.algorithm import Row
+from metrpo.algorithm import Log, Row
 from metrpo.config import Config
 from metrpo.errors import ConfigError
 from metrpo.run.directory import RunDirectory, Saved
@@ -46,9 +46,13 @@ def init(config: Config) -> Saved:
     return state
 
 
-def step(config: Config, state: Saved, progress: Progress = SILENT) -> tuple[Saved, Row]:
-    """One outer iteration of the config's method: the next state and its row of metrics."""
-    following: tuple[Saved, Row] = import_module(METHODS[config.method]).step(config, state, progress)
+def step(config: Config, state: Saved, progress: Progress = SILENT, log: Log | None = None) -> tuple[Saved, Row]:
+    """One outer iteration of the config's method: the next state and its row of metrics.
+
+    Real episodes go to `log` as they end, where the method is ours: the baselines learn where steps cost nothing.
+    """
+    logged = (log,) if config.method == "model-based" else ()
+    following: tuple[Saved, Row] = import_module(METHODS[config.method]).step(config, state, progress, *logged)
     return following
 
 
@@ -62,28 +66,40 @@ def train(config: Config, run_dir: str | Path | None = None, progress: Progress 
     """
     template = init(config)
     if run_dir is None:
-        return _loop(config, _checked(config, template), progress, lambda state, row: row)
+        check(config)
+        return _loop(config, template, progress, lambda state, row: row)
     with RunDirectory(run_dir, config) as run:
-        return _loop(config, run.load(template) or _checked(config, template), progress, run.save)
+        state = run.load(template)
+        if state is None:
+            check(config)
+        return _loop(config, state or template, progress, run.save, run.episodes)
 
 
-def _checked(config: Config, first: Saved) -> Saved:
-    """The first state, once the formulas of a task that is not ours have been held against its environment."""
+def check(config: Config) -> None:
+    """Holds the formulas of a task that is not ours against its environment (`metrpo.world.check`).
+
+    Raises `TaskError` where they differ.
+    """
     task = get_task(config.task)
     ours = task.make is None or task.name in KNOWN  # which the tests hold against their environments
     if not (ours or config.trust_reward or config.learn_reward):
         check_formulas(task, rng_of(config.seed, 0, Stage.COLLECT))
-    return first
 
 
-def _loop(config: Config, state: Saved, progress: Progress, save: Callable[[Saved, Row], Mapping[str, Any]]) -> Saved:
+def _loop(
+    config: Config,
+    state: Saved,
+    progress: Progress,
+    save: Callable[[Saved, Row], Mapping[str, Any]],
+    log: Log | None = None,
+) -> Saved:
     seconds: list[float] = []
     try:
         while not finished(config, state):
             started = time.monotonic()
             left = _iterations_left(config, state)
             progress.begin(state.iteration + 1, None if left is None else state.iteration + left)
-            state, row = step(config, state, progress)
+            state, row = step(config, state, progress, log)
             written = save(state, row)
             # Of the last three: iterations grow with the data, and the first one compiled.
             seconds = [*seconds, time.monotonic() - started][-3:]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Mapping
@@ -119,6 +120,8 @@ def summary(row: Row) -> str:
         f"{row.get('real_steps', 0):>7,} real steps",
         f"return {_number(row.get('return_real')):>7} ± {_number(row.get('return_real_std'))}",
     ]
+    if math.isnan(row.get("return_real") or 0.0):  # only another program can play
+        parts[1] = f"collected {_number(row.get('return_collected')):>7}"
     if "return_imagined" in row:
         parts.append(f"imagined {_number(row['return_imagined']):>7}")
     seconds = sum(v for name, v in row.items() if name.startswith("seconds_") and v is not None)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
 
 import gymnasium
 import numpy as np
@@ -30,15 +32,24 @@ def collect(
     """
     episodes: list[Episode] = []
     steps = 0
-    env = task.make_env()
-    try:
+    with closing(play(task, draw_act, itertools.repeat(rng))) as played:
         while steps < at_least:
-            episodes.append(_episode(env, draw_act(rng), _seed(rng)))
+            episodes.append(next(played))
             steps += len(episodes[-1].rewards)
             on_episode(steps)
+    return episodes
+
+
+def play(
+    task: Task, draw_act: Callable[[np.random.Generator], Act], rngs: Iterable[np.random.Generator]
+) -> Generator[Episode]:
+    """One whole episode for each of `rngs`, which decides its start and its noise; `draw_act(rng)` acts in it."""
+    env = task.make_env()
+    try:
+        for rng in rngs:
+            yield _episode(env, draw_act(rng), _seed(rng))
     finally:
         env.close()
-    return episodes
 
 
 def evaluate(task: Task, act: Act, episodes: int, seed: int) -> np.ndarray:

@@ -222,9 +222,10 @@ def _add(
 ) -> None:
     """Makes a task known to metrpo and, as `metrpo/<name>-v0`, to Gymnasium."""
     _ROBOTS[name] = robot
-    task = register(Task(name, f"metrpo/{name}-v0", *sizes, horizon, reward, terminated, unseen, description))
+    env_id = f"metrpo/{name}-v0"
+    register(Task(name, env_id, *sizes, horizon, reward, terminated, unseen, description))
     gymnasium.register(
-        task.env_id,
+        env_id,
         entry_point="metrpo.world.mujoco:MujocoTask",
         max_episode_steps=horizon,
         disable_env_checker=True,  # it costs every step of every run what the tests check once

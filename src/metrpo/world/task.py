@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import gymnasium
 
+from metrpo.errors import TaskError
 from metrpo.types import Array
 
 
@@ -17,8 +18,8 @@ class Task:
 
     name: str
     """As typed on the command line, "Swimmer"."""
-    env_id: str
-    """Gymnasium id, "metrpo/Swimmer-v0"."""
+    env_id: str | None
+    """Gymnasium id, "metrpo/Swimmer-v0"; None, and no `make`: only another program can play it (see `metrpo init`)."""
     state_size: int
     """S"""
     action_size: int
@@ -38,10 +39,25 @@ class Task:
     """Makes the environment, in place of `gymnasium.make(env_id)`."""
 
     @property
+    def playable(self) -> bool:
+        """Whether there is an environment to step."""
+        return self.env_id is not None or self.make is not None
+
+    @property
     def learned(self) -> tuple[str, ...]:
         """What the models predict besides the state, in the order of their outputs: "reward", "end"."""
         return ("reward",) * (self.reward is None) + ("end",) * (self.terminated == "learned")
 
     def make_env(self, **kwargs: Any) -> gymnasium.Env:
-        """A fresh environment with the time limit of the task (`kwargs` such as `render_mode="rgb_array"`)."""
-        return self.make(**kwargs) if self.make else gymnasium.make(self.env_id, **kwargs)
+        """A fresh environment with the time limit of the task (`kwargs` such as `render_mode="rgb_array"`).
+
+        Raises `TaskError` when there is none.
+        """
+        if self.make is not None:
+            return self.make(**kwargs)
+        if self.env_id is None:
+            raise TaskError(
+                f"{self.name}: expected an environment, got none: its episodes come from another program "
+                "(metrpo.append_episode, or metrpo collect DIR --data FILE) and metrpo improve DIR learns from them"
+            )
+        return gymnasium.make(self.env_id, **kwargs)

@@ -1,0 +1,125 @@
+"""Real episodes on disk from the moment they end: what a run has collected and not yet learned from.
+
+    DIR/episodes/00000012.npz    the thirteenth episode of the run: states, actions, rewards, terminated
+
+Episodes are numbered over the whole run, whoever appends them: the loop, or a robot's own program (`append_episode`).
+The checkpoint of an iteration says how many it has learned from; their files go once no kept checkpoint needs them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metrpo.errors import RunDirectoryError, TaskError
+from metrpo.run.files import read_arrays, sync_directory, write_arrays
+from metrpo.run.policy_file import load_policy
+from metrpo.types import Episode
+
+
+class EpisodeLog:
+    """The episodes of one run directory (see above)."""
+
+    def __init__(self, run_dir: Path) -> None:
+        self._folder = run_dir / "episodes"
+        self.start(after=0)
+
+    def start(self, after: int) -> None:
+        """The state has learned from the first `after` episodes."""
+        self.taken = after
+        """Number of the first episode that may be pending."""
+        self.read = after
+        """Number after the last episode that `pending` gave or `append` wrote."""
+
+    def pending(self) -> list[Episode]:
+        """The episodes that the state has not learned from, in order.
+
+        Raises `DamagedFile` when one is not as it was written, `RunDirectoryError` when one cannot be read.
+        """
+        numbers = [n for n in self._numbers() if n >= self.taken]
+        self.read = max([self.taken, *(n + 1 for n in numbers)])
+        return [self._load(n) for n in numbers]
+
+    def append(self, episode: Episode) -> Path:
+        """Puts an episode on disk, whole or not at all, under the next free number; others may append meanwhile.
+
+        Raises `RunDirectoryError` when it cannot be written.
+        """
+        number = max([self.taken, *(n + 1 for n in self._numbers())])
+        arrays = {**episode._asdict(), "terminated": np.bool_(episode.terminated)}
+        arrays = {name: np.asarray(array) for name, array in arrays.items()}
+        mine = self._folder / f"from-{os.getpid()}.npz"
+        write_arrays(mine, arrays, {})
+        try:
+            while True:
+                try:
+                    os.link(mine, path := self._path(number))  # unlike a rename, it never replaces another's episode
+                    sync_directory(self._folder)
+                    break
+                except FileExistsError:
+                    number += 1
+        except OSError as error:
+            raise RunDirectoryError(f"cannot write {path}: {error.strerror or error}") from error
+        finally:
+            mine.unlink()
+        self.read = number + 1
+        return path
+
+    def forget(self, before: int) -> None:
+        """Deletes the episodes with smaller numbers; the last of all stays, for whoever appends numbers from it on."""
+        for number in self._numbers()[:-1]:
+            if number < before:
+                self._path(number).unlink(missing_ok=True)
+
+    def _numbers(self) -> list[int]:
+        found = (re.fullmatch(r"(\d{8,})\.npz", path.name) for path in self._folder.glob("*.npz"))
+        return sorted(int(match[1]) for match in found if match)
+
+    def _path(self, number: int) -> Path:
+        return self._folder / f"{number:08d}.npz"
+
+    def _load(self, number: int) -> Episode:
+        path = self._path(number)
+        arrays, _ = read_arrays(path)
+        try:
+            return Episode(arrays["states"], arrays["actions"], arrays["rewards"], bool(arrays["terminated"]))
+        except (KeyError, ValueError) as error:
+            raise RunDirectoryError(f"{path} holds no episode ({error}); delete it to go on without") from error
+
+
+def append_episode(
+    run_dir: str | Path, states: Sequence[Any], actions: Sequence[Any], rewards: Sequence[float], terminated: bool
+) -> Path:
+    """Hands a run one real episode of L steps, to learn from in its next iteration; needs NumPy only.
+
+    `states` [L + 1, S] with the one after the last step, `actions` [L, A] in [-1, 1] as executed, `rewards` [L];
+    `terminated`: the task ended the episode, not the clock. May be called while another program improves the policy.
+    Returns the file, which is whole when this returns.
+
+    Raises `TaskError` when the arrays do not fit each other or the run's policy, or are not finite;
+    `RunDirectoryError` when `run_dir` holds no run or cannot be written.
+    """
+    info = load_policy(run_dir).info
+    given = {"states": states, "actions": actions, "rewards": rewards}
+    arrays = {name: np.asarray(value, np.float32) for name, value in given.items()}
+    length = len(arrays["rewards"])
+    shapes = {
+        "states": (length + 1, info.observation_size),
+        "actions": (length, info.action_size),
+        "rewards": (length,),
+    }
+    for name, array in arrays.items():
+        if array.shape != shapes[name] or length == 0:
+            expected = list(shapes[name]) if length else "at least one step"
+            raise TaskError(f"append_episode: {name}: expected {expected}, got shape {list(array.shape)}")
+        if not np.isfinite(array).all():
+            raise TaskError(f"append_episode: {name}: expected finite numbers; cut the episode before the first other")
+    beyond = float(np.abs(arrays["actions"]).max())
+    if beyond > 1 + 1e-6:
+        raise TaskError(f"append_episode: actions: expected numbers in [-1, 1], got {beyond:.4g}; divide by the range")
+    return EpisodeLog(Path(run_dir)).append(Episode(**arrays, terminated=bool(terminated)))

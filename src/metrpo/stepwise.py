@@ -1,0 +1,94 @@
+"""One outer iteration in separate steps, where another program plays the episodes: a robot's own, say.
+
+    begin(config, DIR)        writes the untrained policy
+    repeat:
+        DIR/policy.npz        plays; its episodes come back by `append_episode`, from a log, or by `collect`
+        improve(DIR)          learns from all that have come, and writes the next policy
+
+Each step leaves the run directory as `train` does, which may go on with it, and the other way round.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from metrpo import algorithm
+from metrpo.algorithm import State
+from metrpo.config import Config
+from metrpo.errors import ConfigError, RunDirectoryError
+from metrpo.run.directory import RunDirectory, stored_config
+from metrpo.run.metrics import Row
+from metrpo.run.progress import SILENT, Progress
+from metrpo.training import check
+from metrpo.types import Episode
+from metrpo.world import logged
+
+
+def begin(config: Config, run_dir: str | Path) -> None:
+    """Makes `run_dir` a run that has learned nothing yet; its policy can play at once.
+
+    Raises `RunDirectoryError` when `run_dir` cannot be used or holds a run, `TaskError` and `ConfigError` as `train`.
+    """
+    state = _ours(config)
+    with RunDirectory(run_dir, config) as run:
+        if run.load(state) is not None:
+            raise RunDirectoryError(f"{run_dir} holds a run already: go on with metrpo improve, or choose another")
+        check(config)
+        run.begin(state)
+
+
+def collect(
+    run_dir: str | Path, at_least: int | None = None, data: str | Path | None = None, progress: Progress = SILENT
+) -> list[Episode]:
+    """Adds real episodes to those that wait, and returns all that do.
+
+    Plays the environment with exploration until the waiting episodes have `at_least` steps (default: the config's
+    `collect.steps`), or reads a log (see `world.logged`). Raises `RunDirectoryError` when `run_dir` holds no run.
+    """
+    config = stored_config(run_dir)
+    with RunDirectory(run_dir, config) as run:
+        state = _state(run, config)
+        if data is not None:
+            for episode in logged.load(data, algorithm.task_for(config)):
+                run.episodes.append(episode)
+            return run.episodes.pending()
+        wanted = config.collect.steps if at_least is None else at_least
+        progress.begin(state.iteration + 1, None)
+        try:
+            return algorithm.collect(config, state, progress, run.episodes, wanted)
+        finally:
+            progress.close()
+
+
+def improve(run_dir: str | Path, progress: Progress = SILENT) -> Row:
+    """Learns from the episodes that wait, one outer iteration, and returns its row of metrics.
+
+    Raises `RunDirectoryError` when `run_dir` holds no run, or no episodes wait.
+    """
+    config = stored_config(run_dir)
+    with RunDirectory(run_dir, config) as run:
+        state = _state(run, config)
+        episodes = run.episodes.pending()
+        if not episodes:
+            raise RunDirectoryError(
+                f"{run_dir}: expected episodes to learn from, got none; add some with metrpo collect {run_dir}, "
+                "or metrpo.append_episode in your robot's program"
+            )
+        progress.begin(state.iteration + 1, None)
+        try:
+            written = run.save(*algorithm.learn(config, state, episodes, progress))
+            progress.end(written, None)
+        finally:
+            progress.close()
+    return written
+
+
+def _ours(config: Config) -> State:
+    if config.method != "model-based":
+        raise ConfigError(f"system: expected one that learns models, got {config.system}; it runs by metrpo train only")
+    return algorithm.init(config)
+
+
+def _state(run: RunDirectory, config: Config) -> State:
+    state = _ours(config)
+    return run.load(state) or state
