@@ -28,6 +28,7 @@ from metrpo import phase
 from metrpo.config import Config
 from metrpo.errors import ConfigError
 from metrpo.model import ensemble as ensembles
+from metrpo.model.calibration import end_calibration
 from metrpo.model.ensemble import Ensemble, Networks
 from metrpo.model.fit import FitInfo, fit
 from metrpo.phase import PhaseInfo
@@ -166,7 +167,11 @@ def learn(
         dataset=dataset,
     )
     collected = float(np.mean([e.rewards.sum() for e in episodes])) if episodes else math.nan
-    return state, _row(config, state, returns, collected, fitted, improved, clock)
+    row = _row(config, state, returns, collected, fitted, improved)
+    if "end" in task.learned:
+        trust = end_calibration(ensemble, dataset.validation)
+        row |= {f"end_{name}": value for name, value in trust._asdict().items()}
+    return state, row | clock.row()
 
 
 def _fit(
@@ -262,7 +267,6 @@ def _row(
     collected: float,
     fitted: FitInfo,
     improved: PhaseInfo,
-    clock: Clock,
 ) -> Row:
     imagined = float(np.mean(improved.values))
     losses = np.asarray(fitted.validation_loss)
@@ -286,7 +290,6 @@ def _row(
         "kl": improved.kl,
         "mean_std": float(np.mean(np.exp(np.asarray(state.policy.log_std)))),
         "diverged": improved.diverged,
-        **clock.row(),
     }
 
 
