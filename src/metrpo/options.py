@@ -33,7 +33,7 @@ class Run(Config):
     real_steps: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
     """Instead of --iterations: go on until this many real steps have been collected; 0: learn from --data alone."""
     data: Annotated[str | None, arg(metavar="FILE")] = None
-    """An .npz of logged transitions to start from: states, actions, rewards, next_states, terminated."""
+    """Logged transitions to begin with: minari:NAME or an .npz of states, actions, rewards, next_states, terminated."""
     run_dir: Annotated[Path | None, arg(metavar="DIR")] = None
     """Where the run lives; default: runs/<task>-[<system>-]<preset>-seed<seed>."""
     device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="{cpu,gpu}")] = None
@@ -84,7 +84,7 @@ class Collect:
     steps: Annotated[int | None, arg(metavar="INT")] = None
     """Play until the episodes that wait have so many steps; default: the run's collect.steps."""
     data: Annotated[str | None, arg(metavar="FILE")] = None
-    """Instead: an .npz of logged transitions: states, actions, rewards, next_states, terminated."""
+    """Instead: minari:NAME, or an .npz of logged states, actions, rewards, next_states, terminated."""
     json: bool = False
     """Print JSON."""
 

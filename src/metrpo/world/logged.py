@@ -10,13 +10,14 @@ import numpy as np
 
 from metrpo.errors import TaskError
 from metrpo.types import Episode
+from metrpo.world import minari_log
 from metrpo.world.task import Task
 
 ARRAYS = ("states", "actions", "rewards", "next_states", "terminated")
 
 
 def load(path: str | Path, task: Task) -> list[Episode]:
-    """The episodes of an `.npz` of n transitions, one after the other.
+    """The episodes of an `.npz` of n transitions, one after the other; or of `minari:NAME` (see `world.minari_log`).
 
     Its arrays: `states` and `next_states` [n, S], `actions` [n, A] in [-1, 1], `rewards` [n], and `terminated` [n] (1
     where the task, not the clock, ended the episode).
@@ -24,6 +25,8 @@ def load(path: str | Path, task: Task) -> list[Episode]:
     An episode goes on where the next transition starts in the state in which this one ended. Files with pickled objects
     are refused. Raises `TaskError` when the file cannot be read, lacks an array, or one does not fit the task.
     """
+    if str(path).startswith(minari_log.PREFIX):
+        return minari_log.load(str(path), task)
     try:
         with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as archive:
             found = {name: archive[name] for name in ARRAYS if name in archive.files}
