@@ -11,7 +11,7 @@ import json
 import logging
 import math
 import os
-import re
+import shlex
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -31,6 +31,7 @@ from metrpo.options import (
     Render,
     Reproduce,
     Run,
+    Sweep,
     Tasks,
     Train,
     parse,
@@ -91,9 +92,11 @@ def _train(command: Train) -> int:
 
 def _run(command: Run) -> tuple[Config, Path]:
     """The settings, and where the run lives."""
+    from metrpo.run.files import folder_name
+
     config = Config(**{f.name: getattr(command, f.name) for f in dataclasses.fields(Config)})
     system = "" if config.system == "me-trpo" else f"{config.system}-"
-    task = re.sub(r"[^\w.-]+", "-", config.task)  # a task may be named path/to/file.py:name
+    task = folder_name(config.task)
     return config, command.run_dir or Path("runs") / f"{task}-{system}{config.preset}-seed{config.seed}"
 
 
@@ -257,6 +260,35 @@ def _json(numbers: Mapping[str, float | None]) -> str:
     return json.dumps({name: None if value is None or math.isnan(value) else value for name, value in numbers.items()})
 
 
+def _sweep(command: Sweep) -> int:
+    from metrpo.experiments.reproduce import reproduce
+    from metrpo.experiments.sweep import Grid, from_file, seeds_of, values_of
+    from metrpo.run.machine import cores
+
+    if command.spec is not None:
+        grid = from_file(command.spec)
+    else:
+        settings = dict(values_of(text) for text in command.set)
+        grid = Grid(command.tasks, command.systems, seeds_of(command.seeds), command.preset, settings)
+    runs = grid.runs()
+    print(f"{command.out}: {len(runs)} runs", flush=True)
+    if command.dry_run:
+        for run in runs:
+            print(f"{run.name}:  metrpo train {shlex.join(run.arguments)}")
+        return 0
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        failed = reproduce(runs, command.out, command.jobs or cores(), lambda text: print(text, flush=True))
+    except (KeyboardInterrupt, _Terminated):
+        print(
+            f"metrpo: stopped; {command.out} keeps every finished iteration. The same command goes on.", file=sys.stderr
+        )
+        raise
+    if failed:
+        print(f"metrpo: {len(failed)} of {len(runs)} runs failed; the same command tries again", file=sys.stderr)
+    return 1 if failed else 0
+
+
 def _version() -> int:
     from metrpo.run.files import metrpo_version
 
@@ -280,4 +312,5 @@ _COMMANDS: dict[type, Callable[[Any], int]] = {
     Doctor: _doctor,
     Bench: _bench,
     Reproduce: _reproduce,
+    Sweep: _sweep,
 }

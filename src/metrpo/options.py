@@ -244,7 +244,46 @@ class Reproduce:
                 raise ConfigError(f"{name}: expected at least 1, got {value}")
 
 
-Command = Train | Init | Collect | Improve | Evaluate | Render | Export | Tasks | Doctor | Bench | Reproduce
+@dataclass(frozen=True)
+class Sweep:
+    """Run a grid: every task with every system, seed and combination of settings, each an ordinary `metrpo train`.
+
+    Finished runs are kept, stopped ones go on, a run that fails does not stop the others. For example:
+        metrpo sweep --tasks Swimmer HalfCheetah --seeds 0:5 --out runs/seeds
+        metrpo sweep --tasks Swimmer --set ensemble.members=1,5,10 trpo.max_kl=0.01,0.03 --seeds 0:3 --jobs 4
+        metrpo sweep grid.toml --dry-run
+
+    where grid.toml holds, say:
+        tasks = ["Swimmer"]
+        seeds = "0:3"
+        set.ensemble.members = [1, 5, 10]
+    """
+
+    spec: Annotated[Positional[Path | None], arg(metavar="SPEC")] = None
+    """The grid as a TOML file: tasks, systems, seeds, preset and a table [set]; instead of the options below."""
+    tasks: tuple[str, ...] = ("Swimmer",)
+    """Tasks, as metrpo train takes them."""
+    systems: tuple[System, ...] = ("me-trpo",)
+    """Systems, as metrpo train takes them."""
+    seeds: str = "0:3"
+    """Seeds: a number, a range such as 0:5 (0 to 4), or a list such as 0,2,7."""
+    preset: Preset = "fast"
+    """What all other settings start from."""
+    set: tuple[str, ...] = ()
+    """Settings and their values: ensemble.members=1,5,10 or ensemble.hidden=[200,200],[512]."""
+    jobs: Annotated[int | None, arg(metavar="INT")] = None
+    """Runs at a time, on cores of their own; default: one for each core."""
+    out: Annotated[Path, arg(metavar="DIR")] = Path("runs/sweep")
+    """Folder of the runs: <task>/<system>,<setting>=<value>/seed-<seed>."""
+    dry_run: bool = False
+    """Only say what would be run."""
+
+    def __post_init__(self) -> None:
+        if self.jobs is not None and self.jobs < 1:
+            raise ConfigError(f"jobs: expected at least 1, got {self.jobs}")
+
+
+Command = Train | Init | Collect | Improve | Evaluate | Render | Export | Tasks | Doctor | Bench | Reproduce | Sweep
 
 _DESCRIPTION = """Model-Ensemble Trust-Region Policy Optimization: control learnt from few real steps.
 
@@ -295,6 +334,7 @@ def _with_defaults(run: Run, arguments: list[str], quiet: bool = False) -> Comma
         | Annotated[Doctor, subcommand("doctor")]
         | Annotated[Bench, subcommand("bench")]
         | Annotated[Reproduce, subcommand("reproduce")]
+        | Annotated[Sweep, subcommand("sweep")]
     )
     return tyro.cli(
         commands,

@@ -9,9 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from metrpo.config import Config
+from metrpo.config import Config, Preset, flatten
 from metrpo.errors import ConfigError
 from metrpo.presets import override, preset
+from metrpo.run.files import folder_name
 from metrpo.systems import Overrides
 
 PAPER_TASKS = ("Swimmer", "Snake", "Hopper", "HalfCheetah", "Ant", "Humanoid")
@@ -177,12 +178,14 @@ class Run:
     seed: int
     overrides: tuple[tuple[str, Any], ...]
     """On top of the preset."""
-    preset: Literal["fast", "paper"]
+    preset: Preset
+    variant: str = ""
+    """Its folder, where the system's name does not say what it is."""
 
     @property
     def name(self) -> str:
         """Where it lies under the folder of all runs."""
-        return f"{self.task}/{self.system}/seed-{self.seed}"
+        return f"{folder_name(self.task)}/{self.variant or self.system}/seed-{self.seed}"
 
     @property
     def config(self) -> Config:
@@ -193,8 +196,13 @@ class Run:
     def arguments(self) -> list[str]:
         """What follows `metrpo train` to run it."""
         words = [self.task, "--system", self.system, "--preset", self.preset, "--seed", str(self.seed)]
+        usual = flatten(preset(self.task, self.preset, self.system))
         for name, value in self.overrides:
-            words += [f"--{name.replace('_', '-')}", *map(str, value if isinstance(value, tuple) else (value,))]
+            option = name.replace("_", "-")
+            if not isinstance(value, bool):
+                words += [f"--{option}", *map(str, value if isinstance(value, tuple) else (value,))]
+            elif value != usual[name]:
+                words.append(f"--{option}" if value else f"--no-{option}")
         return words
 
 

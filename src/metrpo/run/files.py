@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import os
+import re
 import subprocess
 import zipfile
 from collections.abc import Mapping
@@ -58,6 +59,11 @@ def atomic_write(path: Path, content: bytes | str) -> None:
 def temporary_path(path: Path) -> Path:
     """Where a file is written before it is renamed: hidden, in the same directory, with the same suffix."""
     return path.with_name(f".{path.stem}.tmp{path.suffix}")
+
+
+def folder_name(task: str) -> str:
+    """A task's name as that of a folder: path/to/file.py:task has more in it than a folder may have."""
+    return re.sub(r"[^\w.-]+", "-", task)
 
 
 def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str, Any]) -> None:

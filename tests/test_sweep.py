@@ -1,0 +1,136 @@
+"""Grids of runs: all combinations, refused as a whole when one cannot be, each what `metrpo train` would run."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from metrpo import cli, options
+from metrpo.config import Config
+from metrpo.errors import ConfigError, TaskError
+from metrpo.experiments import reproduce
+from metrpo.experiments.sweep import Grid, from_file, seeds_of, values_of
+from metrpo.run import machine
+
+GRID = Grid(
+    ("Swimmer", "mbbl/Pendulum"),
+    ("me-trpo", "k-1"),
+    (0, 1),
+    settings={"trpo.max_kl": [0.01, 0.05], "ensemble.hidden": [[8], [16, 16]], "deterministic": [True]},
+)
+
+
+def test_every_combination_is_a_run_of_its_own():
+    runs = GRID.runs()
+    assert len(runs) == len({run.name for run in runs}) == 2 * 2 * 2 * 2 * 2
+    assert [run.seed for run in runs] == [0] * 16 + [1] * 16, "a first seed of everything comes first"
+    assert runs[0].name == "Swimmer/me-trpo,trpo.max_kl=0.01,ensemble.hidden=8,deterministic=True/seed-0"
+    assert {run.name.count("/") for run in runs} == {2}
+    c = runs[-1].config
+    assert (c.task, c.system, c.seed, c.ensemble.members) == ("mbbl/Pendulum", "k-1", 1, 1)
+    assert (c.trpo.max_kl, c.ensemble.hidden, c.deterministic) == (0.05, (16, 16), True)
+
+
+def test_what_is_run_is_what_the_grid_says(monkeypatch):
+    monkeypatch.setattr(machine, "prepare", lambda *_: None)
+    for run in Grid(("Swimmer",), settings=GRID.settings | {"imagine.horizon": [50], "learn_reward": [False]}).runs():
+        typed = options.parse(["train", *run.arguments])
+        assert Config(**{f.name: getattr(typed, f.name) for f in dataclasses.fields(Config)}) == run.config
+
+
+@pytest.mark.parametrize(
+    ("grid", "message"),
+    [
+        (Grid(("Swimmer",), settings={"trpo.max_lk": [1]}), "unknown setting 'trpo.max_lk'"),
+        (Grid(("Swimmer",), settings={"trpo.max_kl": [0.1, -1.0]}), "trpo.max_kl: expected a finite number > 0"),
+        (Grid(("Swimmer",), settings={"trpo.max_kl": []}), "expected at least one"),
+        (Grid(()), "expected at least one"),
+        (Grid(("Swimmer",), ("me-trop",)), "systems: expected some of me-trpo, .* got me-trop"),
+    ],
+)
+def test_a_grid_with_an_impossible_run_is_refused_as_a_whole(grid, message):
+    with pytest.raises(ConfigError, match=message):
+        grid.runs()
+
+
+def test_an_unknown_task_is_refused():
+    with pytest.raises(TaskError, match="unknown task 'Swimer'"):
+        Grid(("Swimmer", "Swimer")).runs()
+
+
+@pytest.mark.parametrize(("text", "seeds"), [("3", (3,)), ("0:3", (0, 1, 2)), (":2", (0, 1)), ("0,2,7", (0, 2, 7))])
+def test_seeds(text, seeds):
+    assert seeds_of(text) == seeds
+
+
+@pytest.mark.parametrize("text", ["", "a", "3:3", "-1", "1:", "0;1"])
+def test_wrong_seeds(text):
+    with pytest.raises(ConfigError, match="seeds: expected"):
+        seeds_of(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "values"),
+    [
+        ("ensemble.members=1,5,10", "ensemble.members", [1, 5, 10]),
+        ("ensemble.hidden=[200,200],[512]", "ensemble.hidden", [[200, 200], [512]]),
+        ("imagine.sampling=step_rand,model_mean", "imagine.sampling", ["step_rand", "model_mean"]),
+        ("imagine.horizon=None,50", "imagine.horizon", [None, 50]),
+        ("deterministic=true,False", "deterministic", [True, False]),
+    ],
+)
+def test_values(text, name, values):
+    assert values_of(text) == (name, values)
+
+
+@pytest.mark.parametrize("text", ["ensemble.members", "=1", "ensemble.members="])
+def test_wrong_values(text):
+    with pytest.raises(ConfigError, match="set: expected NAME=VALUE"):
+        values_of(text)
+
+
+def test_a_file_says_the_same_as_options(tmp_path):
+    file = tmp_path / "grid.toml"
+    file.write_text(
+        'tasks = ["Swimmer", "mbbl/Pendulum"]\nsystems = ["me-trpo", "k-1"]\nseeds = "0:2"\n'
+        "[set]\ntrpo.max_kl = [0.01, 0.05]\nensemble.hidden = [[8], [16, 16]]\ndeterministic = true\n"
+    )
+    assert from_file(file).runs() == GRID.runs()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("tasks = [", "expected a TOML file"),
+        ('task = ["Swimmer"]', "got task"),
+        ("seeds = 3", "expected lists"),
+        ('tasks = "Swimmer"', "expected lists"),
+        ('tasks = ["Swimmer"]\nset = 3', "expected lists"),
+        ('seeds = "x"', "seeds: expected"),
+    ],
+)
+def test_a_wrong_file_is_named(tmp_path, text, message):
+    file = tmp_path / "grid.toml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        from_file(file)
+    with pytest.raises(ConfigError, match="expected a TOML file"):
+        from_file(tmp_path / "none.toml")
+
+
+def test_the_command_runs_the_grid_and_says_how_it_ended(tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def two_of_three(runs, out, jobs, tell):
+        asked.append((len(runs), out, jobs))
+        return runs[:1]
+
+    monkeypatch.setattr(reproduce, "reproduce", two_of_three)
+    command = ["sweep", "--set", "ensemble.members=1,5", "--seeds", "0:2", "--jobs", "3", "--out", str(tmp_path)]
+    assert cli.main(command) == 1
+    assert "1 of 4 runs failed" in capsys.readouterr().err
+    assert asked == [(4, tmp_path, 3)]
+    assert cli.main([*command, "--dry-run"]) == 0
+    assert capsys.readouterr().out.count("metrpo train Swimmer") == 4
+    assert len(asked) == 1
