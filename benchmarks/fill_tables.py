@@ -1,25 +1,41 @@
-"""Puts the figures' tables into docs/reproduction.md: `python benchmarks/fill_tables.py`, after `metrpo reproduce`.
+"""Puts the tables of results into the pages: `python benchmarks/fill_tables.py`, after `metrpo reproduce`.
 
-Between `<!-- NAME -->` and `<!-- end -->` goes `results/laptop/figures/NAME.md`.
+Between `<!-- NAME -->` and `<!-- end -->` of docs/reproduction.md goes `results/laptop/figures/NAME.md`; elsewhere the
+page's table of runs is replaced by what `summarise.py` makes of the folders in `PAGES`.
 """
 
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
-PAGE, FIGURES = ROOT / "docs" / "reproduction.md", ROOT / "results" / "laptop" / "figures"
+from summarise import HEADER, ROOT, table
+
+PAGE, FIGURES = ROOT.parent / "docs" / "reproduction.md", ROOT / "laptop" / "figures"
+PAGES = {
+    "README.md": ["laptop/*/me-trpo"],
+    "docs/fast-preset.md": ["ensemble-size", "fast-before", "fast-choices"],
+    "docs/environments.md": ["own"],
+}
 
 
-def filled(page: str) -> str:
-    """The page with every table as it is on disk."""
+def with_figures(page: str) -> str:
+    """The page with every figure's table as it is on disk."""
 
-    def table(found: re.Match[str]) -> str:
+    def figure(found: re.Match[str]) -> str:
         return f"{found[1]}\n{(FIGURES / f'{found[2]}.md').read_text().strip()}\n{found[3]}"
 
-    return re.sub(r"(<!-- ([\w-]+) -->)\n.*?(<!-- end -->)", table, page, flags=re.DOTALL)
+    return re.sub(r"(<!-- ([\w-]+) -->)\n.*?(<!-- end -->)", figure, page, flags=re.DOTALL)
+
+
+def with_runs(page: str, patterns: list[str]) -> str:
+    """The page with its one table of runs made anew."""
+    runs = table([path for pattern in patterns for path in ROOT.glob(pattern)])
+    head = re.escape(f"| {' | '.join(HEADER)} |\n")
+    return re.sub(rf"{head}(\|.*\n)+", lambda _: runs + "\n", page)
 
 
 if __name__ == "__main__":
-    PAGE.write_text(filled(PAGE.read_text()))
+    PAGE.write_text(with_figures(PAGE.read_text()))
+    for name, patterns in PAGES.items():
+        path = ROOT.parent / name
+        path.write_text(with_runs(path.read_text(), patterns))

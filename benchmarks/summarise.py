@@ -28,6 +28,8 @@ def row(system: Path) -> tuple[str, ...]:
     runs = [read_metrics(path) for path in sorted(system.glob("seed-*/metrics.csv"))]
 
     def over_seeds(values: list[float], digits: int = 1) -> str:
+        if np.isnan(values).all():
+            return "-"  # nothing was played by this program: see examples/robot
         spread = f" ({', '.join(f'{v:.{digits}f}' for v in values)})" if len(values) > 1 else ""
         return f"{np.mean(values):.{digits}f}{spread}"
 

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from metrpo.config import ADDED, BUDGET_FIELDS, Config, difference, flatten, from_json, to_json
 from metrpo.errors import ConfigError
 from metrpo.presets import override
+from metrpo.run.files import folder_name
 
 # A share, a rate, a penalty: what lies between 0 and 1 is possible for every number with a fraction.
 KINDS = {
@@ -121,6 +122,10 @@ IMPOSSIBLE = {
     "advantage.discount": [-0.1, 1.1, float("nan")],
     "advantage.gae_lambda": [-0.1, 1.1, float("nan")],
     "advantage.ridge": [0.0, -1.0],
+    "advantage.value_hidden": [(0,), (64, -1)],
+    "advantage.value_steps": [0],
+    "advantage.value_batch_size": [0, -1],
+    "advantage.value_learning_rate": [0.0, -1e-3, float("nan"), float("inf")],
     "trpo.max_kl": [0.0, -0.01, float("nan")],
     "trpo.cg_iterations": [0],
     "trpo.fisher_every": [0],
@@ -149,6 +154,7 @@ FREE |= {
     "system",
     "method",
     "svg.horizon",
+    "advantage.baseline",
     "trust_reward",
     "data",
     "learn_reward",
@@ -183,6 +189,7 @@ def test_an_impossible_value_is_refused_by_name(name, value):
         ("validate.threshold", 1.0),
         ("ensemble.hidden", ()),
         ("policy.hidden", ()),
+        ("advantage.value_hidden", ()),
         ("seed", 2**31 - 1),
         ("real_steps", None),
     ],
@@ -304,4 +311,4 @@ def test_a_setting_newer_than_a_file_has_its_default_and_no_other_may_be_missing
     assert from_json(edited(**added)) == from_json(edited())
     committed = sorted((Path(__file__).parents[1] / "results").glob("*/*/*/seed-*/config.json"))
     assert committed
-    assert [path for path in committed if from_json(path.read_text()).task.replace("/", "-") not in path.parts] == []
+    assert [path for path in committed if folder_name(from_json(path.read_text()).task) not in path.parts] == []

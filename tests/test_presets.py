@@ -8,9 +8,9 @@ import typing
 import pytest
 
 from metrpo import systems
-from metrpo.config import Config, System, flatten, from_json, to_json
+from metrpo.config import Config, Preset, System, flatten, from_json, to_json
 from metrpo.errors import ConfigError
-from metrpo.presets import preset
+from metrpo.presets import LONG_HORIZON_ALL, preset
 from metrpo.systems import SYSTEMS
 from metrpo.world.registry import tasks
 
@@ -46,6 +46,7 @@ CITED = {
     "advantage.discount": (1.0, "section 2: the undiscounted sum of rewards; code: gamma 1"),
     "advantage.gae_lambda": (1.0, "code"),
     "advantage.ridge": (1e-5, "code: linear feature baseline"),
+    "advantage.baseline": ("linear", "code: linear feature baseline"),
     "trpo.max_kl": (0.01, "A.1.3: step size delta_KL 0.01"),
     "trpo.cg_iterations": (10, "code"),
     "fit.products": ("float32", "code"),
@@ -93,6 +94,10 @@ OURS = {
     "system": ("me-trpo", "the label"),
     "method": ("model-based", "the paper's own"),
     "imagine.horizon": (None, "section 2: the full horizon"),
+    "advantage.value_hidden": ((64, 64), "of the network that the paper does not have"),
+    "advantage.value_steps": (40, "of the network that the paper does not have"),
+    "advantage.value_batch_size": (1000, "of the network that the paper does not have"),
+    "advantage.value_learning_rate": (1e-3, "of the network that the paper does not have"),
     "imagine.disagreement": (0.0, "the paper's future work: off"),
     "trust_reward": (False, "the paper's tasks are our own"),
     "learn_reward": (False, "section 2: the reward function is known"),
@@ -124,7 +129,7 @@ def test_every_value_has_its_source():
     assert not CITED.keys() & OURS.keys()
 
 
-@pytest.mark.parametrize("name", ["fast", "paper"])
+@pytest.mark.parametrize("name", typing.get_args(Preset))
 @pytest.mark.parametrize("task", TASKS)
 def test_every_preset_can_be_built_and_written(task, name):
     config = preset(task, name)
@@ -147,9 +152,28 @@ def test_fast_collects_as_the_paper_does_for_the_same_policy(task):
 
 
 @pytest.mark.parametrize(("variant", "task"), [("HopperUpright", "Hopper"), ("HumanoidStandup", "Humanoid")])
-@pytest.mark.parametrize("name", ["fast", "paper"])
+@pytest.mark.parametrize("name", typing.get_args(Preset))
 def test_variants_share_their_tasks_settings(variant, task, name):
     assert flatten(preset(variant, name)) == flatten(preset(task, name)) | {"task": variant}
+
+
+def test_long_horizon_cuts_imagined_episodes_and_values_the_rest():
+    fast, long = preset("mbbl/HalfCheetah"), preset("mbbl/HalfCheetah", "long-horizon")
+    assert (long.advantage.baseline, long.imagine.horizon, long.imagine.start) == ("network", 30, "anywhere")
+    # The value of a cut episode leans on itself; exploration leaves the policy recognisable.
+    assert long.advantage.discount < 1
+    assert long.collect.max_std < fast.collect.max_std
+    assert long.collect.parameter_noise == 0
+    # No task of 1,000 steps is asked for more data in an iteration, and the policies are comparable.
+    assert long.collect.steps <= fast.collect.steps
+    assert long.policy.hidden == fast.policy.hidden
+    assert long.ensemble == fast.ensemble
+
+
+@pytest.mark.parametrize("task", ["mbbl/HalfCheetah", "mbbl/CartPole", *TASKS])
+def test_long_horizon_changes_what_its_row_says_and_nothing_else(task):
+    fast, long = flatten(preset(task)), flatten(preset(task, "long-horizon"))
+    assert long == fast | LONG_HORIZON_ALL | {"preset": "long-horizon"}
 
 
 def test_settings_on_top():
@@ -159,7 +183,7 @@ def test_settings_on_top():
 
 
 def test_an_unknown_preset_is_refused():
-    with pytest.raises(ConfigError, match="preset: expected fast or paper, got 'quick'"):
+    with pytest.raises(ConfigError, match="preset: expected one of fast, paper, long-horizon, got 'quick'"):
         preset("Swimmer", "quick")
     with pytest.raises(ConfigError, match="unknown setting 'colour'"):
         preset("Swimmer", colour=1)
@@ -171,7 +195,7 @@ def test_every_system_that_can_be_named_stands_in_the_table():
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
-@pytest.mark.parametrize("name", ["fast", "paper"])
+@pytest.mark.parametrize("name", typing.get_args(Preset))
 def test_a_system_changes_what_its_row_says_and_nothing_else(system, name):
     config = preset("Swimmer", name, system)
     row = SYSTEMS[system] | (systems.PAPER.get(system, {}) if name == "paper" else {})
