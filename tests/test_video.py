@@ -82,6 +82,14 @@ def test_no_gl_says_what_to_install(tmp_path, monkeypatch):
     assert not any(tmp_path.iterdir())
 
 
+def test_an_environment_without_pictures_is_named(tmp_path, monkeypatch):
+    with pytest.raises(VideoError, match=r"cannot be made with render_mode.*TypeError.*--no-video"):
+        record(lambda: None, zero, tmp_path / "v.gif")
+    monkeypatch.setattr(Pictures, "render", lambda self: None)
+    with pytest.raises(VideoError, match=r"expected a picture \[height, width, 3\], got NoneType"):
+        record(Pictures, zero, tmp_path / "v.gif")
+
+
 def test_other_suffixes_are_refused(tmp_path):
     with pytest.raises(VideoError, match=r"ends in \.mp4 or \.gif"):
         record(Pictures, zero, tmp_path / "v.avi")

@@ -50,7 +50,7 @@ def start(run_dir, seed, cache):
     for name, value in TINY.items():
         option = f"--{name.replace('_', '-')}"
         settings += [option] if value is True else [option, *(value if isinstance(value, tuple) else [value])]
-    return metrpo(cache, "train", "probe:PROBE", "--seed", seed, "--run-dir", run_dir, *settings)
+    return metrpo(cache, "train", "probe:PROBE", "--seed", seed, "--run-dir", run_dir, "--no-video", *settings)
 
 
 def output(run_dir):

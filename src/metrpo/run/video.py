@@ -89,7 +89,13 @@ def _renders(backend: str) -> bool:
 def _episode(
     make_env: Callable[..., Any], policy: Callable[[np.ndarray], np.ndarray], seed: int
 ) -> tuple[list[Any], int]:
-    env = make_env(render_mode="rgb_array")
+    try:
+        env = make_env(render_mode="rgb_array")
+    except Exception as error:  # whatever somebody's constructor raises
+        raise VideoError(
+            f'the environment cannot be made with render_mode="rgb_array" ({type(error).__name__}: {error}): '
+            "let its constructor take render_mode, or do without: --no-video"
+        ) from error
     try:
         observation, _ = env.reset(seed=seed)
         frames, over = [_frame(env)], False
@@ -111,6 +117,8 @@ def _frame(env: Any) -> np.ndarray:
         raise VideoError(
             f"cannot render here ({type(error).__name__}: {error}): {INSTALL_GL}; see: metrpo doctor"
         ) from error
+    if np.ndim(picture) != 3:
+        raise VideoError(f"render: expected a picture [height, width, 3], got {type(picture).__name__}")
     height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2  # what yuv420p can hold
     return np.ascontiguousarray(picture[:height, :width])
 
