@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 _COLOURS = ("#1f5fa8", "#d9772b", "#3f8f5f", "#b0413e", "#7a5aa6", "#8a6d3b")
 _REAL, _IMAGINED = _COLOURS[:2]
+_COLUMNS = 3
+"""Panels side by side, so that a page's width still shows them."""
 
 
 def draw(name: str, runs: Sequence[Run], out: Path, path: Path) -> bool:
@@ -42,7 +44,8 @@ def draw(name: str, runs: Sequence[Run], out: Path, path: Path) -> bool:
 
 def _draw_curves(picture: Picture, figure: Figure, curves: list[Curves]) -> None:
     tasks = list(dict.fromkeys(c.task for c in curves))
-    picture.set_size_inches(max(5.2 * len(tasks), 6.5), 4.9)
+    columns = min(len(tasks), _COLUMNS)
+    picture.set_size_inches(max(5.2 * columns, 6.5), 0.5 + 4.4 * -(-len(tasks) // _COLUMNS))
     labels = list(figure.systems)
     for axes, task in zip(_panels(picture, len(tasks)), tasks, strict=True):
         for c in (c for c in curves if c.task == task):
@@ -51,7 +54,7 @@ def _draw_curves(picture: Picture, figure: Figure, curves: list[Curves]) -> None
         axes.set_xlabel("real steps" if figure.log_steps else "real steps (thousands)")
         axes.set_ylabel("return")
         if figure.log_steps:
-            axes.set_xscale("log")
+            _logarithmic(axes)
     handles: dict[str, Any] = {}
     for axes in picture.axes:
         lines, names = axes.get_legend_handles_labels()
@@ -117,10 +120,24 @@ _KINDS: dict[str, Callable[[Picture, Figure, list[Curves]], None]] = {
 
 
 def _panels(picture: Picture, count: int) -> list[Axes]:
-    panels = list(picture.subplots(1, count, squeeze=False)[0])
+    columns = min(count, _COLUMNS)
+    panels = list(picture.subplots(-(-count // columns), columns, squeeze=False).flat)
     for axes in panels:
         _tidy(axes)
-    return panels
+    for axes in panels[count:]:
+        axes.set_axis_off()
+    return panels[:count]
+
+
+def _logarithmic(axes: Axes) -> None:
+    """Real steps by powers of ten, with few enough labels for a panel of less than one."""
+    from matplotlib.ticker import EngFormatter, LogLocator
+
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.xaxis.set_minor_locator(LogLocator(subs="all"))
+    axes.xaxis.set_minor_formatter("")
 
 
 def _tidy(axes: Axes) -> None:
