@@ -1,13 +1,14 @@
 """Puts the tables of results into the pages: `python benchmarks/fill_tables.py`, after `metrpo reproduce`.
 
 Between `<!-- NAME -->` and `<!-- end -->` of docs/reproduction.md goes `results/laptop/figures/NAME.md`; elsewhere the
-page's table of runs is replaced by what `summarise.py` makes of the folders in `PAGES`.
+page's table of runs is replaced by what `summarise.py` makes of the folders in `PAGES`, and that of MBBL's tasks.
 """
 
 from __future__ import annotations
 
 import re
 
+import mbbl_table
 from summarise import HEADER, ROOT, table
 
 PAGE, FIGURES = ROOT.parent / "docs" / "reproduction.md", ROOT / "laptop" / "figures"
@@ -34,8 +35,13 @@ def with_runs(page: str, patterns: list[str]) -> str:
     return re.sub(rf"{head}(\|.*\n)+", lambda _: runs + "\n", page)
 
 
+def with_mbbl(page: str) -> str:
+    """The page with the table of MBBL's tasks made anew."""
+    return re.sub(r"(<!-- mbbl -->\n).*?(<!-- end -->)", rf"\1{mbbl_table.table()}\n\2", page, flags=re.DOTALL)
+
+
 if __name__ == "__main__":
     PAGE.write_text(with_figures(PAGE.read_text()))
     for name, patterns in PAGES.items():
         path = ROOT.parent / name
-        path.write_text(with_runs(path.read_text(), patterns))
+        path.write_text(with_mbbl(with_runs(path.read_text(), patterns)))

@@ -1,0 +1,41 @@
+"""MBBL's tasks, published and ours: `python benchmarks/mbbl_table.py` prints the table of docs/environments.md.
+
+Published: Wang et al. 2019, Benchmarking Model-Based Reinforcement Learning (arXiv 1907.02057), returns after 200,000
+real steps, mean and standard deviation over its seeds, in `results/published/mbbl_200k.csv`. Ours: the last real return
+(deterministic policy, mean of 20 episodes) of every run in `results/own/mbbl-*/long-horizon`.
+"""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+from summarise import ROOT
+
+from metrpo import read_metrics
+
+OURS = "metrpo, long-horizon"
+
+
+def ours(task: str) -> str:
+    """Mean and standard deviation over the seeds, and after how many real steps."""
+    runs = [read_metrics(path) for path in sorted((ROOT / "own").glob(f"mbbl-{task}/long-horizon/seed-*/metrics.csv"))]
+    if not runs:
+        return "not run"
+    last = np.array([run[-1]["return_real"] for run in runs], float)
+    steps = min(int(run[-1]["real_steps"] or 0) for run in runs)
+    spread = f"±{last.std():.1f}" if len(runs) > 1 else ""
+    return f"**{last.mean():.1f}{spread}** ({len(runs)} x {steps / 1000:.0f}k)"
+
+
+def table() -> str:
+    """The table as Markdown: our row, then the published ones."""
+    with (ROOT / "published" / "mbbl_200k.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    tasks = [name for name in rows[0] if name != "algo"]
+    cells = [["", *tasks], ["---"] * (len(tasks) + 1), [OURS, *map(ours, tasks)], *([*row.values()] for row in rows)]
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+
+
+if __name__ == "__main__":
+    print(table())

@@ -1,0 +1,135 @@
+"""How far the models can be trusted: their errors over several steps, and where imagination leaves the data.
+
+A record only, nothing is learned from it: one row of numbers after every policy phase, for the report and for a person
+who asks why a run does not learn.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from metrpo.model.ensemble import Ensemble, predict
+from metrpo.model.imagine import EXPLODED, Keys, disagreement, step_rand
+from metrpo.policy import gaussian
+from metrpo.policy.gaussian import Policy
+from metrpo.types import Array, Transitions
+
+HORIZONS = (1, 5, 10, 25)
+"""Steps after which predictions are compared with what happened; the task's horizon comes as the last."""
+_STARTS = 100
+_LONGEST = 200
+"""Imagined and predicted steps at most, for tasks of a thousand: an error long before that is error enough."""
+
+
+class Diagnosis(NamedTuple):
+    """What the models are worth on real episodes that they were not trained on, and in imagination."""
+
+    errors: dict[int, np.ndarray]
+    """After k steps, [S]: root mean square error of the open-loop prediction over that of predicting no change, each
+    member by itself; 1 is no better than that, NaN where no held-out episode is so long."""
+    disagreement_real: float
+    """Mean spread of the members' predictions on held-out transitions (`imagine.disagreement`)."""
+    disagreement_imagined: float
+    """The same along imagined episodes of the policy: far above the real one, it has gone where the models guess."""
+    outside: float
+    """Share of these imagined states that leave the range of the training data in any dimension."""
+
+    def row(self, last: int) -> dict[str, float]:
+        """As columns: `error_K` (median over the dimensions), `error_K_D` for each dimension, and the rest.
+
+        The horizon of the task, `last`, is called T, whatever its number, so that tasks share their columns.
+        """
+        names = {k: "T" if k == last else str(k) for k in self.errors}
+        overall = {f"error_{names[k]}": _median(e) for k, e in self.errors.items()}
+        each = {f"error_{names[k]}_{d}": float(x) for k, e in self.errors.items() for d, x in enumerate(e)}
+        rest = {name: float(getattr(self, name)) for name in self._fields[1:]}
+        return overall | rest | each
+
+
+def diagnose(
+    ensemble: Ensemble, policy: Policy, held_out: Transitions, train: Transitions, horizon: int, key: Array
+) -> Diagnosis:
+    """A diagnosis of the fitted `ensemble` and the accepted `policy`.
+
+    `held_out` and `train` are host arrays, whole episodes one after the other; imagined episodes of `horizon` steps
+    (at most 200) start in held-out states.
+    """
+    length = min(horizon, _LONGEST)
+    size = train.states.shape[1]
+    rows, steps = _starts(held_out, length)
+    actions = np.asarray(held_out.actions)[np.minimum(rows[:, None] + np.arange(length), len(held_out.actions) - 1)]
+    starts = np.asarray(held_out.states)[rows]
+    predicted, spread, imagined, guessed = jax.device_get(_rollouts(ensemble, policy, starts, actions, key))
+    after = np.asarray(held_out.states) + np.asarray(held_out.deltas)[:, :size]
+    errors = {}
+    for k in [k for k in HORIZONS if k < length] + [length]:
+        there = steps >= k
+        ends = after[np.minimum(rows + k - 1, len(after) - 1)][there]
+        errors[k] = _relative(predicted[k - 1][:, there], starts[there], ends)
+    low, high = train.states.min(0), train.states.max(0)
+    outside = ~np.all((imagined >= low) & (imagined <= high), axis=-1)  # also where it is no number
+    return Diagnosis(errors, float(spread.mean()), float(guessed.mean()), float(outside.mean()))
+
+
+def _starts(t: Transitions, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rows to start from, [N], and how many steps of the same episode follow each, [N]."""
+    size = t.states.shape[1]
+    states, after = np.asarray(t.states), np.asarray(t.states) + np.asarray(t.deltas)[:, :size]
+    scale = np.abs(states).max(0) + 1e-6
+    goes_on = np.all(np.abs(after[:-1] - states[1:]) <= 1e-5 * scale, axis=1)
+    firsts = np.concatenate([[0], np.flatnonzero(~goes_on) + 1])
+    lengths = np.diff([*firsts, len(states)])
+    follow = np.concatenate([np.arange(n, 0, -1) for n in lengths])
+    # Half of them where an episode begins, for whole episodes; half evenly over all.
+    chosen = np.concatenate([np.resize(firsts[::-1], _STARTS // 2), _evenly(len(states), _STARTS - _STARTS // 2)])
+    return chosen, np.minimum(follow[chosen], length)
+
+
+def _evenly(count: int, number: int) -> np.ndarray:
+    return np.linspace(0, count - 1, number).astype(int)
+
+
+def _relative(predicted: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
+    """[K, n, S], [n, S], [n, S] -> [S]."""
+    if not len(ends):
+        return np.full(starts.shape[1], np.nan)
+    clipped = np.clip(np.nan_to_num(predicted.astype(np.float64), nan=EXPLODED), -EXPLODED, EXPLODED)
+    error = np.sqrt(np.mean((clipped - ends) ** 2, axis=(0, 1)))
+    still = np.sqrt(np.mean((starts.astype(np.float64) - ends) ** 2, axis=0))
+    return np.where(still > 0, error / np.where(still > 0, still, 1.0), np.nan)
+
+
+def _median(values: Sequence[float] | np.ndarray) -> float:
+    finite = np.asarray(values)[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else float("nan")
+
+
+@jax.jit
+def _rollouts(
+    ensemble: Ensemble, policy: Policy, starts: Array, actions: Array, key: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Every member's open-loop predictions [L, K, N, S], the spread on the starts [N], and imagined states [L, N, S]
+    of the policy with the members' spread along them [L, N]."""
+    size = starts.shape[-1]
+    members = ensemble.members
+
+    def open_loop(states: Array, action: Array) -> tuple[Array, Array]:
+        following = predict(ensemble, states, jnp.broadcast_to(action, (members, *action.shape)))[..., :size]
+        return following, following
+
+    def imagined(states: Array, key: Array) -> tuple[Array, tuple[Array, Array]]:
+        mean = jnp.clip(gaussian.mean(policy, states), -1.0, 1.0)
+        spread = disagreement(ensemble, states, mean)
+        following = step_rand(ensemble, states, mean, Keys(key, key))[..., :size]
+        return jnp.clip(following, -EXPLODED, EXPLODED), (following, spread)
+
+    length = actions.shape[1]
+    copies = jnp.broadcast_to(starts, (members, *starts.shape))
+    _, predicted = jax.lax.scan(open_loop, copies, jnp.swapaxes(jnp.asarray(actions), 0, 1))
+    _, (dreamt, spread) = jax.lax.scan(imagined, jnp.asarray(starts), jax.random.split(key, length))
+    return predicted, disagreement(ensemble, jnp.asarray(starts), jnp.asarray(actions)[:, 0]), dreamt, spread
