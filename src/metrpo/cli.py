@@ -14,7 +14,8 @@ import os
 import shlex
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,23 +29,27 @@ from metrpo.options import (
     Export,
     Improve,
     Init,
+    Plot,
     Render,
+    Report,
     Reproduce,
     Run,
     Sweep,
     Tasks,
     Train,
+    Watch,
     parse,
 )
+from metrpo.run.interrupt import Interruptible, Stopped, stop
+from metrpo.run.progress import Progress, mute_broken_output
 
-
-class _Terminated(BaseException):
-    """SIGTERM arrived."""
+_log = logging.getLogger("metrpo")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns the exit code: 0, 2 after a wrong input, 130 after Ctrl-C, 143 after SIGTERM."""
     arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
+    _occupy_standard_files()
     logging.basicConfig(format="metrpo: %(message)s", level=logging.WARNING)
     if arguments == ["--version"]:
         return _version()
@@ -52,17 +57,20 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = parse(arguments)
         return _COMMANDS[type(command)](command)
     except MetrpoError as error:
-        print(f"metrpo: {error}", file=sys.stderr)
+        _say(f"metrpo: {error}")
+        _say_how_to_go_on(error, arguments)
         return 2
     except KeyboardInterrupt:
         return 130
-    except _Terminated:
-        return 143
+    except Stopped as stopped:
+        _say_how_to_go_on(stopped, arguments)
+        return 128 + stopped.number
     except BrokenPipeError:  # `metrpo train --help | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except SystemExit as end:  # tyro has printed help (0) or what was wrong (2)
         return end.code if isinstance(end.code, int) else 2
+    finally:
+        mute_broken_output()  # the interpreter flushes once more
 
 
 def _train(command: Train) -> int:
@@ -70,24 +78,49 @@ def _train(command: Train) -> int:
     from metrpo.training import train
 
     config, run_dir = _run(command)
-    signal.signal(signal.SIGTERM, _terminate)
-    progress = default_progress()
-    try:
+    with _attended(run_dir, default_progress(), keeps_episodes=config.method == "model-based") as progress:
         train(config, run_dir, progress)
         progress.close()
-        _report(run_dir, command.video)
-    except (KeyboardInterrupt, _Terminated):
-        progress.close()
-        print(f"metrpo: stopped; {run_dir} keeps every finished iteration. The same command goes on.", file=sys.stderr)
-        raise
-    except TaskError as error:
-        if any(run_dir.glob("checkpoints/*.npz")) or any(run_dir.glob("episodes/*.npz")):
-            kept = f"{run_dir} keeps every finished iteration and real episode. The same command goes on"
-            raise TaskError(f"{error}\nmetrpo: stopped; {kept}.") from error
-        raise
-    finally:
-        progress.close()
+        try:
+            _report(run_dir, command.video)
+        except OSError as error:  # nobody reads on; the run is complete
+            _log.warning("cannot say more (%s: %s); %s is complete", type(error).__name__, error, run_dir)
     return 0
+
+
+@contextmanager
+def _attended(run_dir: Path, shown: Progress, keeps_episodes: bool = True) -> Iterator[Interruptible]:
+    """What reports on a run in this block; whoever or whatever stops the run there is told how to go on."""
+    with Interruptible(shown, keeps_episodes) as progress:
+        try:
+            yield progress
+        except (Stopped, KeyboardInterrupt, MetrpoError) as error:
+            begun = any(run_dir.glob("checkpoints/*.npz")) or any(run_dir.glob("episodes/*.npz"))
+            if isinstance(error, Stopped) or progress.began or (begun and isinstance(error, TaskError)):
+                error.add_note(f"{run_dir} keeps every finished iteration and real episode. The same command goes on.")
+            raise
+        finally:
+            progress.close()
+
+
+def _say_how_to_go_on(error: BaseException, arguments: Sequence[str]) -> None:
+    for note in getattr(error, "__notes__", ()):
+        _say(f"metrpo: stopped; {note}\n\n  {shlex.join(['metrpo', *arguments])}\n")
+
+
+def _occupy_standard_files() -> None:
+    # Started with stdout or stderr closed, the next file opened would take its place, and a library's warnings.
+    while (handle := os.open(os.devnull, os.O_RDWR)) <= 2:
+        os.set_inheritable(handle, True)
+    os.close(handle)
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 - as long as the process
+
+
+def _say(text: str) -> None:
+    with suppress(OSError):  # stderr may be gone, which is no reason to end otherwise
+        print(text, file=sys.stderr)
 
 
 def _run(command: Run) -> tuple[Config, Path]:
@@ -118,8 +151,8 @@ def _collect(command: Collect) -> int:
     from metrpo.run.progress import SILENT, default_progress
     from metrpo.stepwise import collect
 
-    signal.signal(signal.SIGTERM, _terminate)
-    waiting = collect(command.dir, command.steps, command.data, SILENT if command.json else default_progress())
+    with _attended(command.dir, SILENT if command.json else default_progress()) as progress:
+        waiting = collect(command.dir, command.steps, command.data, progress)
     found: dict[str, float] = {"episodes": len(waiting), "steps": sum(len(e.rewards) for e in waiting)}
     found |= {"return": sum(float(e.rewards.sum()) for e in waiting) / max(len(waiting), 1)}
     text = "{episodes} episodes of {steps:,} steps wait, mean return {return:.1f}"
@@ -136,8 +169,8 @@ def _improve(command: Improve) -> int:
     from metrpo.run.progress import SILENT, default_progress
     from metrpo.stepwise import improve
 
-    signal.signal(signal.SIGTERM, _terminate)
-    row = improve(command.dir, SILENT if command.json else default_progress())
+    with _attended(command.dir, SILENT if command.json else default_progress()) as progress:
+        row = improve(command.dir, progress)
     print(_json(row) if command.json else f"  policy   {command.dir / FILE}")
     return 0
 
@@ -158,8 +191,8 @@ def _report(run_dir: Path, video: bool) -> None:
     print(f"  {'video':<8} ", end="", flush=True)  # it takes a while
     try:
         print(render(run_dir))
-    except VideoError as error:
-        print(f"none: {error}")
+    except Exception as error:  # the run is complete without it
+        print(f"none: {error}" if isinstance(error, VideoError) else f"none ({type(error).__name__}: {error})")
 
 
 def _evaluate(command: Evaluate) -> int:
@@ -239,13 +272,13 @@ def _reproduce(command: Reproduce) -> int:
     runs = runs_of(command.figure, command.scale, command.tasks, command.seeds)
     out = command.out or Path("runs") / f"reproduce-{command.scale}"
     names = list(FIGURES) if command.figure == "all" else [command.figure]
-    signal.signal(signal.SIGTERM, _terminate)
+    signal.signal(signal.SIGTERM, stop)
     failed = []
     try:
         if command.run:
             failed = reproduce(runs, out, command.jobs or cores(), tell)
-    except (KeyboardInterrupt, _Terminated):
-        print(f"metrpo: stopped; {out} keeps every finished iteration. The same command goes on.", file=sys.stderr)
+    except (KeyboardInterrupt, Stopped):
+        _say(f"metrpo: stopped; {out} keeps every finished iteration. The same command goes on.")
         raise
     numbers = publish(names, command.scale, command.tasks, runs, out, tell)
     if command.json:
@@ -276,17 +309,65 @@ def _sweep(command: Sweep) -> int:
         for run in runs:
             print(f"{run.name}:  metrpo train {shlex.join(run.arguments)}")
         return 0
-    signal.signal(signal.SIGTERM, _terminate)
+    signal.signal(signal.SIGTERM, stop)
     try:
         failed = reproduce(runs, command.out, command.jobs or cores(), lambda text: print(text, flush=True))
-    except (KeyboardInterrupt, _Terminated):
-        print(
-            f"metrpo: stopped; {command.out} keeps every finished iteration. The same command goes on.", file=sys.stderr
-        )
+    except (KeyboardInterrupt, Stopped):
+        _say(f"metrpo: stopped; {command.out} keeps every finished iteration. The same command goes on.")
         raise
     if failed:
         print(f"metrpo: {len(failed)} of {len(runs)} runs failed; the same command tries again", file=sys.stderr)
     return 1 if failed else 0
+
+
+def _report_page(command: Report) -> int:
+    from metrpo.run.files import atomic_write
+    from metrpo.seeing.page import page, record
+    from metrpo.seeing.runs import find
+
+    found = find(command.dirs)
+    atomic_write(command.out, page(found, command.out.parent))
+    said = record(found)
+    if command.json:
+        print(json.dumps({"report": str(command.out), **said}))
+        return 0
+    for run in said["runs"]:
+        for concern in run["warnings"]:
+            if concern["level"] == "warning":
+                print(f"{run['path']}: {concern['text']}")
+    _tell_skipped(said["skipped"])
+    print(command.out)
+    return 0
+
+
+def _plot(command: Plot) -> int:
+    from metrpo.seeing.plot import plot
+    from metrpo.seeing.runs import find
+
+    found = find(command.dirs)
+    _tell_skipped([{"path": path, "why": why} for path, why in found.skipped])
+    print(plot(found.runs, command.out, command.x, command.y))
+    return 0
+
+
+def _tell_skipped(skipped: Sequence[Mapping[str, Any]]) -> None:
+    for one in skipped:
+        _log.warning("left out %s: %s", one["path"], one["why"])
+
+
+def _watch(command: Watch) -> int:
+    from metrpo.seeing.runs import find
+    from metrpo.seeing.watch import standing, watch
+
+    if command.json:
+        found = find(command.dirs)
+        runs = [dataclasses.asdict(standing(run)) for run in found.runs]
+        skipped = [{"path": str(path), "why": why} for path, why in found.skipped]
+        print(json.dumps({"runs": runs, "skipped": skipped}))
+        return 0
+    with suppress(KeyboardInterrupt):  # how to end it
+        watch(command.dirs, command.every, command.once)
+    return 0
 
 
 def _version() -> int:
@@ -294,10 +375,6 @@ def _version() -> int:
 
     print(f"metrpo {metrpo_version()}")
     return 0
-
-
-def _terminate(*_: object) -> None:
-    raise _Terminated
 
 
 _COMMANDS: dict[type, Callable[[Any], int]] = {
@@ -313,4 +390,7 @@ _COMMANDS: dict[type, Callable[[Any], int]] = {
     Bench: _bench,
     Reproduce: _reproduce,
     Sweep: _sweep,
+    Report: _report_page,
+    Plot: _plot,
+    Watch: _watch,
 }

@@ -283,7 +283,97 @@ class Sweep:
             raise ConfigError(f"jobs: expected at least 1, got {self.jobs}")
 
 
-Command = Train | Init | Collect | Improve | Evaluate | Render | Export | Tasks | Doctor | Bench | Reproduce | Sweep
+@dataclass(frozen=True)
+class Report:
+    """Write one HTML page about some runs: health warnings in plain words, learning curves, diagnostics, videos.
+
+    The page works without a network, on a phone too. Folders are searched for runs. For example:
+        metrpo report runs/Swimmer-fast-seed0
+        metrpo report runs/sweep --out sweep.html
+        metrpo report runs --json                         # the warnings and numbers, for scripts; writes the page too
+    """
+
+    dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
+    """Run directories, or folders with runs inside."""
+    out: Annotated[Path, arg(metavar="FILE")] = Path("report.html")
+    """File to write."""
+    json: bool = False
+    """Print what the page says as JSON."""
+
+    def __post_init__(self) -> None:
+        _require_dirs(self.dirs)
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Draw learning curves: a line with a band over the seeds for every group of runs that share their settings.
+
+    For example:
+        metrpo plot runs/sweep
+        metrpo plot runs/sweep --out sweep.pdf --x wall_seconds
+        metrpo plot runs --y gap --x iteration            # any column of metrics.csv
+    """
+
+    dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
+    """Run directories, or folders with runs inside."""
+    out: Annotated[Path, arg(metavar="FILE")] = Path("curves.png")
+    """File to write, .png, .svg or .pdf."""
+    x: Literal["real_steps", "wall_seconds", "iteration"] = "real_steps"
+    """What the curves are drawn against."""
+    y: Annotated[str, arg(metavar="COLUMN")] = "return_real"
+    """Column of metrics.csv to draw."""
+
+    def __post_init__(self) -> None:
+        _require_dirs(self.dirs)
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Show where many runs stand, in a table that stays up to date: returns, warnings, time left, running or stopped.
+
+    Ctrl-C ends it; the runs go on. For example:
+        metrpo watch runs
+        metrpo watch runs/sweep runs/Swimmer-fast-seed0 --every 30
+        metrpo watch runs --once                          # the table once; --json for scripts
+    """
+
+    dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR...")]
+    """Run directories, or folders with runs inside."""
+    every: float = 5.0
+    """Seconds between two looks."""
+    once: bool = False
+    """Look once."""
+    json: bool = False
+    """Print JSON, once."""
+
+    def __post_init__(self) -> None:
+        _require_dirs(self.dirs)
+        if not 0.1 <= self.every < float("inf"):
+            raise ConfigError(f"every: expected at least 0.1 seconds, got {self.every}")
+
+
+def _require_dirs(dirs: tuple[Path, ...]) -> None:
+    if not dirs:
+        raise ConfigError("expected at least one run directory or folder with runs, got none; try: runs")
+
+
+Command = (
+    Train
+    | Init
+    | Collect
+    | Improve
+    | Evaluate
+    | Render
+    | Export
+    | Tasks
+    | Doctor
+    | Bench
+    | Reproduce
+    | Sweep
+    | Report
+    | Plot
+    | Watch
+)
 
 _DESCRIPTION = """Model-Ensemble Trust-Region Policy Optimization: control learnt from few real steps.
 
@@ -335,6 +425,9 @@ def _with_defaults(run: Run, arguments: list[str], quiet: bool = False) -> Comma
         | Annotated[Bench, subcommand("bench")]
         | Annotated[Reproduce, subcommand("reproduce")]
         | Annotated[Sweep, subcommand("sweep")]
+        | Annotated[Report, subcommand("report")]
+        | Annotated[Plot, subcommand("plot")]
+        | Annotated[Watch, subcommand("watch")]
     )
     return tyro.cli(
         commands,

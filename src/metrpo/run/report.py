@@ -29,13 +29,13 @@ def draw_curve(rows: Sequence[Row], path: Path, title: str) -> None:
 
     figure = Figure(figsize=(9, 7), dpi=150, layout="constrained")
     steps = _column(rows, "real_steps") / 1000
-    if any("gap" in row for row in rows):
+    if any(np.isfinite(_column(rows, name)).any() for name in ("gap", "fraction_improved")):
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1])
         _draw_gap(below, steps, rows)
     else:  # a method without models
         above = below = figure.subplots()
     _draw_returns(above, steps, rows)
-    figure.suptitle(title, fontsize=14, fontweight="bold")
+    figure.suptitle(title, fontsize=14, fontweight="bold", parse_math=False)  # a task's name is no formula
     best = _column(rows, "return_real")
     if np.isfinite(best).any():
         above.set_title(
@@ -56,9 +56,11 @@ def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
     real, std, collected, imagined = (
         _column(rows, name) for name in ("return_real", "return_real_std", "return_collected", "return_imagined")
     )
-    axes.fill_between(
-        steps, real - std, real + std, color=_REAL, alpha=0.15, linewidth=0, label="± 1 std over episodes"
-    )
+    played = np.isfinite(real).any()  # not where another program does
+    if played:
+        axes.fill_between(
+            steps, real - std, real + std, color=_REAL, alpha=0.15, linewidth=0, label="± 1 std over episodes"
+        )
     axes.plot(
         steps,
         collected,
@@ -69,7 +71,8 @@ def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
     )
     if np.isfinite(imagined).any():
         axes.plot(steps, imagined, "s-", color=_IMAGINED, linewidth=1.3, markersize=4, label="imagined (models)")
-    axes.plot(steps, real, "o-", color=_REAL, linewidth=2.2, markersize=5, label="real (deterministic policy)")
+    if played:
+        axes.plot(steps, real, "o-", color=_REAL, linewidth=2.2, markersize=5, label="real (deterministic policy)")
     axes.set_ylabel("return of an episode")
     axes.set_ylim(_frame(np.concatenate([real - std, real + std, collected]), imagined))
     axes.legend(loc="best", frameon=False, fontsize=9)
@@ -87,12 +90,13 @@ def _frame(real: np.ndarray, others: np.ndarray) -> tuple[float, float] | None:
 
 
 def _draw_gap(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
-    gap = _column(rows, "gap")
-    axes.axhline(0, color="#333333", linewidth=0.8)
-    axes.fill_between(steps, 0, gap, color=_IMAGINED, alpha=0.2, linewidth=0)
-    axes.plot(steps, gap, "s-", color=_IMAGINED, linewidth=1.3, markersize=4, label="gap: imagined - real")
-    axes.set_ylabel("gap")
-    share = axes.twinx()
+    gap, share = _column(rows, "gap"), axes
+    if np.isfinite(gap).any():
+        axes.axhline(0, color="#333333", linewidth=0.8)
+        axes.fill_between(steps, 0, gap, color=_IMAGINED, alpha=0.2, linewidth=0)
+        axes.plot(steps, gap, "s-", color=_IMAGINED, linewidth=1.3, markersize=4, label="gap: imagined - real")
+        axes.set_ylabel("gap")
+        share = axes.twinx()
     share.plot(
         steps,
         100 * _column(rows, "fraction_improved"),
@@ -104,11 +108,10 @@ def _draw_gap(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
     share.set_ylim(-5, 105)
     share.set_ylabel("models improved (%)", color=_SHARE)
     share.spines["top"].set_visible(False)
-    lines, names = axes.get_legend_handles_labels()
-    more, more_names = share.get_legend_handles_labels()
+    handles = {name: line for a in (axes, share) for line, name in zip(*a.get_legend_handles_labels(), strict=True)}
     axes.legend(
-        lines + more,
-        names + more_names,
+        list(handles.values()),
+        list(handles),
         ncols=2,
         frameon=False,
         fontsize=9,

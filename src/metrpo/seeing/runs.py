@@ -1,0 +1,191 @@
+"""Finds runs on disk and reads what they have written; what is damaged is named and left out."""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from metrpo.config import Config, difference, from_json
+from metrpo.errors import ConfigError, RunDirectoryError
+from metrpo.run.metrics import Row, read_metrics
+
+_INSIDE = {"checkpoints", "episodes", "events", ".git", ".venv", "node_modules", "__pycache__"}
+"""Folders that hold no runs."""
+
+
+@dataclass(frozen=True)
+class SeenRun:
+    """A run as it lies on disk."""
+
+    path: Path
+    config: Config
+    rows: list[Row]
+    """Its finished iterations; none while it is in its first."""
+
+    def column(self, name: str) -> np.ndarray:
+        """One number an iteration; NaN where there is none."""
+        return column(self.rows, name)
+
+
+class Skipped(NamedTuple):
+    """What looks like a run and cannot be read."""
+
+    path: Path
+    why: str
+
+
+class Found(NamedTuple):
+    """The runs under some folders, in the order of their paths."""
+
+    runs: list[SeenRun]
+    skipped: list[Skipped]
+
+
+def find(paths: Sequence[Path]) -> Found:
+    """The runs that `paths` are or have inside, each once.
+
+    A run is a folder with a config.json and, once an iteration is finished, a metrics.csv. Raises `RunDirectoryError`
+    when a path does not exist, when there is no run at all, or when none can be read.
+    """
+    for path in paths:
+        if not path.is_dir():
+            what = "a file" if path.exists() else "nothing"
+            raise RunDirectoryError(f"{path}: expected a run directory or a folder with runs inside, got {what}")
+    runs, skipped = list[SeenRun](), list[Skipped]()
+    for folder in {folder.resolve(): folder for path in paths for folder in _folders(path)}.values():
+        try:
+            runs.append(read(folder))
+        except RunDirectoryError as error:
+            skipped.append(Skipped(folder, str(error)))
+    if not runs:
+        where = ", ".join(map(str, paths))
+        if skipped:
+            why = "\n".join(f"  {s.why}" for s in skipped)
+            raise RunDirectoryError(f"{where}: expected at least one run that can be read, got none:\n{why}")
+        raise RunDirectoryError(
+            f"{where}: expected a run (config.json and metrics.csv), got none; start one with: metrpo train TASK"
+        )
+    return Found(runs, skipped)
+
+
+def read(folder: Path) -> SeenRun:
+    """The run in `folder`. Raises `RunDirectoryError`, naming the file, when it cannot be read or makes no sense."""
+    file, metrics = folder / "config.json", folder / "metrics.csv"
+    try:
+        config = from_json(file.read_text())
+    except (OSError, ConfigError, UnicodeDecodeError) as error:
+        raise RunDirectoryError(f"{file} cannot be read: {error}; put it back or leave the run out") from None
+    try:
+        _require_whole(metrics)
+        rows = read_metrics(metrics)
+        _require_sense(rows)
+    except FileNotFoundError:
+        rows = []  # in its first iteration
+    except (OSError, ValueError, TypeError, csv.Error) as error:
+        raise RunDirectoryError(f"{metrics} cannot be read: {error}; put it back or leave the run out") from None
+    return SeenRun(folder, config, rows)
+
+
+def column(rows: Iterable[Row], name: str) -> np.ndarray:
+    """One number a row [len(rows)]; NaN where there is none."""
+    values = [row.get(name) for row in rows]
+    return np.array([math.nan if v is None else v for v in values], dtype=float)
+
+
+def is_finished(run: SeenRun) -> bool:
+    """Whether the budget is spent, as far as the metrics say."""
+    if not run.rows:
+        return False
+    if run.config.real_steps:
+        return int(run.rows[-1]["real_steps"] or 0) >= run.config.real_steps
+    return int(run.rows[-1]["iteration"] or 0) >= run.config.iterations
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs of one task that differ in their seed and budget only: the seeds of one learning curve."""
+
+    task: str
+    label: str
+    runs: list[SeenRun]
+
+
+def group(runs: Sequence[SeenRun]) -> list[Group]:
+    """The runs by task and settings, tasks in order of their first run; labels say what tells a task's groups apart."""
+    found: list[list[SeenRun]] = []
+    for run in runs:
+        mine = next((g for g in found if not settings(g[0].config, run.config)), None)
+        if mine is None:
+            found.append([run])
+        else:
+            mine.append(run)
+    groups = []
+    for task in dict.fromkeys(run.config.task for run in runs):
+        here = [g for g in found if g[0].config.task == task]
+        labels = _labels([g[0].config for g in here])
+        groups += [Group(task, label, runs) for label, runs in zip(labels, here, strict=True)]
+    return groups
+
+
+def settings(old: Config, new: Config) -> dict[str, tuple[object, object]]:
+    """Settings that differ, seed and budget aside: `{"ensemble.members": (1, 5)}`."""
+    return {name: values for name, values in difference(old, new).items() if name != "seed"}
+
+
+def _labels(configs: list[Config]) -> list[str]:
+    """A name for each of some configs of one task: the system, and where that is not enough the settings."""
+    systems = [str(c.system) for c in configs]
+    names: list[str] = []
+    for config in configs:
+        alike = [c for c in configs if c.system == config.system]
+        told = list(dict.fromkeys(n for c in alike for n in settings(alike[0], c)))
+        words = [f"{n}={_value(config, n)}" for n in told[:3]] + (["..."] if len(told) > 3 else [])
+        names.append(
+            ", ".join([str(config.system), *words]) if systems.count(str(config.system)) > 1 else config.system
+        )
+    return [n if names.count(n) == 1 else f"{n} ({names[:i].count(n) + 1})" for i, n in enumerate(names)]
+
+
+def _value(config: Config, name: str) -> str:
+    value: object = config
+    for part in name.split("."):
+        value = getattr(value, part)
+    return "x".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def _folders(path: Path) -> list[Path]:
+    found = []
+    for folder, inside, files in os.walk(path):
+        if "metrics.csv" in files or {"config.json", "run.json"} <= set(files):
+            found.append(Path(folder))
+        inside[:] = sorted(name for name in inside if name not in _INSIDE)
+    return found
+
+
+def _require_whole(metrics: Path) -> None:
+    """Raises `ValueError` for a copy that ends early: the reader would take missing cells for empty ones."""
+    lines = metrics.read_text().split("\n")
+    if lines.pop() or any(line.count(",") != lines[0].count(",") for line in lines):
+        raise ValueError("it was cut within a row")
+
+
+def _require_sense(rows: list[Row]) -> None:
+    """Raises `ValueError` for what no run writes: the file was cut or edited."""
+    if not rows:
+        raise ValueError("expected a row for each iteration, got none")
+    columns = list(rows[0])
+    if missing := [name for name in ("iteration", "real_steps", "return_real") if name not in columns]:
+        raise ValueError(f"expected the column {missing[0]}, got {', '.join(map(str, columns))[:80]}")
+    for number, row in enumerate(rows, 1):
+        if None in row or not isinstance(row["iteration"], int) or not isinstance(row["real_steps"], int):
+            raise ValueError(f"row {number}: expected {len(columns)} cells beginning with two counts")
+    counts = [int(row["iteration"] or 0) for row in rows]
+    if counts != sorted(set(counts)):
+        raise ValueError(f"expected iterations that go up, got {counts[:20]}")

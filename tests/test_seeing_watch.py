@@ -1,0 +1,310 @@
+"""metrpo watch and metrpo plot."""
+
+import dataclasses
+import fcntl
+import io
+import itertools
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from metrpo.cli import main
+from metrpo.config import Config, EnsembleConfig
+from metrpo.run.claim import claim
+from metrpo.seeing import watch as watching
+from metrpo.seeing.curves import curve
+from metrpo.seeing.runs import find, group, read
+from metrpo.seeing.watch import SPARKS, is_running, sparkline, standing, watch
+from test_seeing_health import healthy
+from test_seeing_page import a_run
+
+CONFIG = Config("Swimmer", iterations=20)
+TIMED = [r | {"wall_seconds": 2.0 * r["iteration"] ** 2} for r in healthy(10)]
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def printed(paths, width=None, **options):
+    out = io.StringIO()
+    watch(paths, 1.0, True, Console(file=out, width=width, **options))
+    return out.getvalue()
+
+
+def test_a_table_of_runs(tmp_path):
+    a_run(tmp_path / "stopped", CONFIG, TIMED)
+    a_run(tmp_path / "finished", dataclasses.replace(CONFIG, iterations=10, seed=3), TIMED)
+    a_run(tmp_path / "bad", CONFIG).joinpath("config.json").write_text("?")
+    warned = [r | {"diverged": 0.5, "mean_std": 0.001} for r in TIMED]
+    with claim(tmp_path / "running", dataclasses.replace(CONFIG, seed=7)):
+        (tmp_path / "running" / "metrics.csv").write_text(
+            a_run(tmp_path / "x", CONFIG, warned).joinpath("metrics.csv").read_text()
+        )
+        text = printed([tmp_path])
+    lines = text.splitlines()
+    for name in ("task", "seed", "iteration", "return", "best", "gap", "so far", "warnings", "s/iteration", "left"):
+        assert name in lines[0]
+    running, *stopped, finished = [line.split() for line in lines if line.startswith("Swimmer")]
+    assert running[:5] == ["Swimmer", "me-trpo", "7", "10/20", "30,000"]
+    assert running[-1] == "running", "running ones first"
+    # (2 * 100 - 2 * 49) / 3 seconds an iteration, ten to go
+    assert "34.0" in running
+    assert " ".join(running[-5:-1]).endswith("5 min 40 s")
+    assert running[9] == "2", "two warnings"
+    assert all("stopped" in line and line[-1] == "ago" for line in stopped)
+    assert finished[2] == "3"
+    assert finished[-1] == "finished"
+    assert f"cannot be read: {tmp_path}/bad/config.json" in text
+    assert "\x1b" not in text, "no control codes where there is no terminal"
+
+
+def test_json_says_the_same(tmp_path, capsys):
+    a_run(tmp_path / "a", CONFIG, TIMED)
+    fresh = a_run(tmp_path / "b", dataclasses.replace(CONFIG, real_steps=90_000), [])
+    (fresh / "run.json").write_text("{}")
+    assert main(["watch", str(tmp_path), "--json"]) == 0
+    said = json.loads(capsys.readouterr().out)
+    a, b = said["runs"]
+    assert (a["state"], a["iteration"], a["iterations"], a["warnings"]) == ("stopped", 10, 20, 0)
+    assert a["seconds_per_iteration"] == pytest.approx(34.0)
+    assert a["seconds_left"] is None, "nobody is working on it"
+    assert a["returns"] == [pytest.approx(r["return_real"]) for r in TIMED]
+    assert (b["iteration"], b["iterations"], b["return_real"], b["returns"]) == (0, None, None, [])
+    assert said["skipped"] == []
+
+
+def test_the_command_prints_once_and_refuses_what_makes_no_sense(tmp_path, capsys):
+    a_run(tmp_path / "a", CONFIG, TIMED)
+    assert main(["watch", "a", "--once"]) == 0
+    assert "10/20" in capsys.readouterr().out
+    assert main(["watch", "nothing", "--once"]) == 2
+    assert "expected a run directory or a folder with runs inside, got nothing" in capsys.readouterr().err
+    assert main(["watch", "a", "--every", "0"]) == 2
+    assert "every: expected at least 0.1 seconds" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_it_goes_on_until_ctrl_c_and_sees_new_runs(tmp_path, monkeypatch, capsys, terminal):
+    a_run(tmp_path / "runs/a", CONFIG, TIMED)
+    looks = itertools.count()
+
+    def sleep(seconds):
+        assert seconds == 2.5
+        if next(looks) == 1:
+            raise KeyboardInterrupt
+        a_run(tmp_path / "runs/b", dataclasses.replace(CONFIG, task="Hopper"), TIMED)
+
+    out = io.StringIO()
+    monkeypatch.setattr(watching.time, "sleep", sleep)
+    console = Console(file=out, force_terminal=terminal, width=150)
+    monkeypatch.setattr(watching, "Console", lambda: console)
+    assert main(["watch", str(tmp_path / "runs"), "--every", "2.5"]) == 0, "Ctrl-C is how it ends"
+    assert "Hopper" in out.getvalue()
+
+
+def test_a_narrow_terminal_goes_without_some_columns(tmp_path):
+    a_run(tmp_path / "a", CONFIG, TIMED)
+    for width in (60, 80, 100, 130):
+        lines = printed([tmp_path], width, force_terminal=True, no_color=True, legacy_windows=False).splitlines()
+        assert len(lines) == 3, "no line is broken"
+        assert "return" in lines[0]
+        assert "stopped" in lines[2]
+        assert "…" not in lines[2]
+
+
+def test_whether_a_run_lives_is_seen_without_touching_its_lock(tmp_path):
+    config = Config("Swimmer")
+    assert not is_running(tmp_path)
+    held = claim(tmp_path, config)
+    before = (tmp_path / ".lock").stat()
+    assert is_running(tmp_path)
+    after = (tmp_path / ".lock").stat()
+    assert (before.st_mtime_ns, before.st_size) == (after.st_mtime_ns, after.st_size)
+    held.close()
+    assert not is_running(tmp_path), "the file stays, with a pid that lives"
+    assert (tmp_path / ".lock").read_text() == str(os.getpid())
+    with open(tmp_path / "other", "w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        assert not is_running(tmp_path), "another lock of the same process"
+    claim(tmp_path, config).close()  # a look never kept a run from starting
+
+
+def test_watching_never_keeps_a_run_from_starting(tmp_path):
+    """50 claims while another thread looks without a pause."""
+    import threading
+
+    claim(tmp_path, Config("Swimmer")).close()
+    over = threading.Event()
+
+    def look():
+        while not over.is_set():
+            is_running(tmp_path)
+
+    looker = threading.Thread(target=look)
+    looker.start()
+    try:
+        for _ in range(50):
+            claim(tmp_path, Config("Swimmer")).close()
+    finally:
+        over.set()
+        looker.join()
+
+
+def test_without_a_list_of_locks_the_process_counts(tmp_path, monkeypatch):
+    real = Path.read_text
+    monkeypatch.setattr(
+        Path, "read_text", lambda self, *a, **k: real(Path("/nonexistent") if "proc" in str(self) else self, *a, **k)
+    )
+    (tmp_path / ".lock").write_text(str(os.getpid()))
+    assert is_running(tmp_path)
+    (tmp_path / ".lock").write_text("")
+    assert not is_running(tmp_path)
+    (tmp_path / ".lock").write_text("999999999")
+    assert not is_running(tmp_path)
+
+
+def test_budget_in_real_steps(tmp_path):
+    a_run(tmp_path / "a", dataclasses.replace(CONFIG, real_steps=36_000), TIMED)
+    seen = standing(read(tmp_path / "a"), now=time.time() + 100)
+    assert (seen.iteration, seen.iterations, seen.state) == (10, 12, "stopped")
+    assert 99 < seen.seconds_since < 200
+    a_run(tmp_path / "b", dataclasses.replace(CONFIG, real_steps=30_000), TIMED)
+    assert standing(read(tmp_path / "b")).state == "finished"
+    a_run(
+        tmp_path / "c", dataclasses.replace(CONFIG, real_steps=0, iterations=10), [r | {"real_steps": 0} for r in TIMED]
+    )
+    assert standing(read(tmp_path / "c")).state == "finished"
+
+
+def test_sparklines():
+    assert sparkline([]) == ""
+    assert sparkline([None, float("nan")]) == ""
+    assert sparkline([1.0]) == SPARKS[0]
+    assert sparkline(list(range(8))) == SPARKS
+    assert sparkline([0.0, None, 7.0]) == SPARKS[0] + " " + SPARKS[-1]
+    assert len(sparkline(list(range(500)))) == 12
+    assert sparkline(list(range(500)))[-1] == SPARKS[-1]
+
+
+def test_markup_in_a_name_is_text(tmp_path):
+    a_run(tmp_path / "a", dataclasses.replace(CONFIG, task="[red]x[/nope]"), TIMED)
+    assert "[red]x[/nope]" in printed([tmp_path])
+
+
+def some_runs(folder):
+    for seed, factor in enumerate((1.0, 2.0, 3.0)):
+        rows = [r | {"return_real": factor * r["return_real"]} for r in TIMED]
+        a_run(folder / f"five/{seed}", dataclasses.replace(CONFIG, seed=seed), rows)
+    one = dataclasses.replace(CONFIG, system="k-1", ensemble=EnsembleConfig(members=1))
+    a_run(folder / "one", one, TIMED)
+    a_run(folder / "logged", dataclasses.replace(CONFIG, system="k-10", data=r"$\y$.npz"), TIMED)
+    a_run(folder / "unlogged", dataclasses.replace(CONFIG, system="k-10"), TIMED)
+    a_run(folder / "hopper", dataclasses.replace(CONFIG, task=r"Hop_per $\x$"), TIMED)
+    return folder
+
+
+@pytest.mark.parametrize(("name", "magic"), [("a.png", b"\x89PNG"), ("sub/a.svg", b"<?xml"), ("a.PDF", b"%PDF")])
+def test_plot_writes_the_kind_that_is_asked_for_twice_the_same(tmp_path, capsys, name, magic):
+    some_runs(tmp_path / "runs")
+    assert main(["plot", "runs", "--out", name]) == 0
+    assert capsys.readouterr().out == f"{name}\n"
+    first = Path(name).read_bytes()
+    assert first.startswith(magic)
+    assert main(["plot", "runs", "--out", name]) == 0
+    assert Path(name).read_bytes() == first
+    if magic == b"\x89PNG":
+        with Image.open(name) as picture:
+            assert len(set(picture.convert("L").tobytes())) > 20
+
+
+def test_plot_draws_what_is_asked_for(tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: drawn.append(self))
+    some_runs(tmp_path / "runs")
+    for x, y in (("real_steps", "return_real"), ("wall_seconds", "kl"), ("iteration", "gap")):
+        assert main(["plot", "runs", "--x", x, "--y", y]) == 0
+    labels = [(f.axes[0].get_xlabel(), f.axes[0].get_ylabel()) for f in drawn]
+    assert labels == [
+        ("real steps", "real return"),
+        ("wall-clock time (s)", "kl"),
+        ("iteration", "gap: imagined minus real return"),
+    ]
+    panels = {axes.get_title(): axes for axes in drawn[0].axes if axes.get_title()}
+    assert set(panels) == {"Swimmer", r"Hop_per $\x$"}
+    legend = [t.get_text() for t in panels["Swimmer"].get_legend().get_texts()]
+    assert legend == ["me-trpo (3 seeds)", r"k-10, data=$\y$.npz", "k-1", "k-10, data=None"]
+    mean = next(line for line in panels["Swimmer"].lines if line.get_label() == "me-trpo (3 seeds)")
+    assert mean.get_ydata()[-1] == pytest.approx(2 * TIMED[-1]["return_real"]), "the mean of one, two and three times"
+    assert len(panels["Swimmer"].collections) == 1, "one band"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--out", "a.gif"], "out: expected a file name that ends in .png, .svg or .pdf, got a.gif"),
+        (["--y", "nope"], "y: expected a column with numbers (iteration, real_steps, return_real,"),
+        (["--y", "train_loss", "--x", "wall_seconds"], "x: expected a column with numbers"),
+    ],
+)
+def test_plot_says_what_is_wrong(tmp_path, capsys, arguments, said):
+    a_run(tmp_path / "a", CONFIG, [r | {"wall_seconds": None} for r in healthy()])
+    assert main(["plot", "a", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert said in err
+    assert (out, err.count("\n")) == ("", 1)
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+def test_plot_names_what_it_leaves_out(tmp_path, capsys, caplog):
+    a_run(tmp_path / "runs/a")
+    a_run(tmp_path / "runs/b").joinpath("metrics.csv").write_text("x")
+    assert main(["plot", "runs"]) == 0
+    assert "left out runs/b" in caplog.text
+
+
+def test_a_mean_curve_is_where_all_seeds_are(tmp_path):
+    a_run(tmp_path / "a", CONFIG, TIMED)
+    a_run(tmp_path / "b", dataclasses.replace(CONFIG, seed=1), [r | {"return_real": 0.0} for r in TIMED[3:7]])
+    (only,) = group(find([tmp_path]).runs)
+    c = curve(only, "real_steps", "return_real")
+    assert (c.x[0], c.x[-1]) == (12_000, 21_000)
+    assert c.mean[0] == pytest.approx(TIMED[3]["return_real"] / 2)
+    assert np.all(c.low == 0), "of two seeds, their range"
+    np.testing.assert_allclose(c.high, 2 * c.mean)
+    assert len(c.seeds) == 2
+    apart = [TIMED[:3], TIMED[6:]]
+    for name, rows in zip("cd", apart, strict=True):
+        a_run(tmp_path / f"z/{name}", CONFIG, rows)
+    (none,) = group(find([tmp_path / "z"]).runs)
+    assert len(curve(none, "real_steps", "return_real").x) == 0
+    assert len(curve(none, "real_steps", "return_real").seeds) == 2
+
+
+@pytest.mark.parametrize("command", ["report", "plot", "watch"])
+def test_every_help_has_examples(capsys, command):
+    assert main([command, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert f"metrpo {command} runs" in out.replace("usage: metrpo", "")
+    assert "(default: " in out
+
+
+def test_looking_needs_neither_jax_nor_mujoco(tmp_path):
+    a_run(tmp_path / "a", CONFIG, TIMED)
+    code = (
+        "import sys; from metrpo.cli import main; assert main(['report', 'a']) == main(['watch', 'a', '--once']) == 0; "
+    )
+    code += "print([m for m in ('jax', 'mujoco', 'gymnasium', 'matplotlib') if m in sys.modules])"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout.splitlines()[-1] == "[]"
