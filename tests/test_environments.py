@@ -428,8 +428,17 @@ def test_every_sampling_carries_the_learned_outputs_along(sampling):
 
 
 LEARN = override(
-    Config(task="Blind", iterations=3, evaluation_episodes=20),
-    {**probe.LEARN, "collect.steps": 300, "ensemble.hidden": (32,), "fit.max_passes": 150},
+    Config(task="Blind", iterations=6, evaluation_episodes=20),
+    {
+        **probe.LEARN,
+        "collect.steps": 300,
+        # The probe is unstable: bold actions lead far out, where rewards are so large that a reward learned from them
+        # is worth nothing near the optimum (with a std of 3 and noise on the parameters three seeds of five fail).
+        "collect.max_std": 0.5,
+        "collect.parameter_noise": 0.0,
+        "ensemble.hidden": (32,),
+        "fit.max_passes": 300,
+    },
 )
 
 
@@ -442,12 +451,12 @@ def blind(monkeypatch):
 
 
 def test_the_probe_is_learned_without_knowing_its_reward(blind):
-    """From 900 real steps to a loss of 1.2 times the Riccati loss when measured; the first policy loses several."""
+    """From 1,800 real steps to 1.01 to 1.04 times the Riccati loss (seeds 0 to 4); the first policy loses several."""
     optimum = probe.optimum()
     before = probe.real_return(training.init(LEARN).policy)
     after = probe.real_return(training.train(LEARN).policy)
     assert before < 4 * optimum
-    assert 1.4 * optimum <= after <= optimum * 0.9999
+    assert 1.1 * optimum <= after <= optimum * 0.9999
 
 
 # ---------------------------------------------------------------- imagined episodes shorter than the real ones

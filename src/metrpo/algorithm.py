@@ -16,6 +16,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import math
 from contextlib import closing
 from functools import partial
@@ -26,11 +27,12 @@ import numpy as np
 
 from metrpo import phase
 from metrpo.config import Config
-from metrpo.errors import ConfigError
+from metrpo.errors import ConfigError, DivergedError
+from metrpo.finite import naming, require_finite
 from metrpo.model import ensemble as ensembles
 from metrpo.model.calibration import end_calibration
 from metrpo.model.ensemble import Ensemble, Networks
-from metrpo.model.fit import FitInfo, fit
+from metrpo.model.fit import FitInfo, fit, refit
 from metrpo.phase import PhaseInfo
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
@@ -46,6 +48,7 @@ from metrpo.world.dataset import Dataset
 from metrpo.world.registry import get_task, without_formulas
 from metrpo.world.task import Task
 
+_log = logging.getLogger("metrpo")
 Row = dict[str, float | int]
 """One iteration's metrics, in the order of metrics.csv's columns."""
 
@@ -129,7 +132,7 @@ def collect(
     # Each episode has randomness of its own, so that it is the same one after any interruption.
     numbers = itertools.count(len(episodes))
     rngs = (rng_of(config.seed, state.iteration + 1, Stage.COLLECT, number) for number in numbers)
-    with closing(real.play(task_for(config), explorer, rngs)) as played:
+    with naming("collect", state.iteration + 1), closing(real.play(task_for(config), explorer, rngs)) as played:
         while steps < enough:
             episodes.append(next(played))
             if log is not None:
@@ -142,19 +145,26 @@ def collect(
 def learn(
     config: Config, state: State, episodes: list[Episode], progress: Progress = SILENT, clock: Clock | None = None
 ) -> tuple[State, Row]:
-    """The rest of an outer iteration: what `episodes`, and all before them, teach."""
+    """The rest of an outer iteration: what `episodes`, and all before them, teach.
+
+    Raises `DivergedError` where that is not finite and cannot be recovered.
+    """
     task = task_for(config)
     iteration = state.iteration + 1
     clock = clock or Clock()
     rng = rng_of(config.seed, iteration, Stage.SPLIT)
     dataset = datasets.add(state.dataset, episodes, config.collect, rng, task.learned)
+    require_finite("collect", iteration, "leave out the episode that holds it", dataset=dataset)
     with clock("fit"):
         progress.stage("fit", None)
         ensemble, fitted = _fit(config, task, state.networks, dataset, iteration, progress)
+        require_finite("fit", iteration, "start anew with a lower fit.learning_rate", **ensemble._asdict())
     with clock("improve"):
         progress.stage("improve", config.validate.max_updates)
         policy, baseline, improved = _improve(config, task, state, dataset, ensemble, iteration, progress, clock)
-    with clock("evaluate"):
+        advice = "the run was resumed from, or became, a state that cannot go on: use smaller steps or start anew"
+        require_finite("improve", iteration, advice, policy=policy, baseline=baseline)
+    with clock("evaluate"), naming("evaluate", iteration):
         progress.stage("evaluate", config.evaluation_episodes)
         returns = evaluate(config, task, policy, iteration)
     state = State(
@@ -181,15 +191,34 @@ def _fit(
     every = config.fit.reinitialise_every
     if every and (iteration - 1) % every == 0:
         networks = _fresh_networks(config, task, init_key)
-    return fit(
-        networks,
-        ensembles.normaliser_of(dataset.train, config.ensemble.std_floor, config.ensemble.delta_std_floor, task.unseen),
-        jax.device_put(datasets.with_capacity(dataset.train, config.collect.max_train)),
-        jax.device_put(datasets.with_capacity(dataset.validation, config.collect.max_validation)),
-        config.fit,
-        fit_key,
-        lambda passes, losses: progress.update(passes, f"validation loss {float(np.mean(losses)):.4g}"),
-    )
+    e = config.ensemble
+    normaliser = ensembles.normaliser_of(dataset.train, e.std_floor, e.delta_std_floor, task.unseen)
+    train = jax.device_put(datasets.with_capacity(dataset.train, config.collect.max_train))
+    validation = jax.device_put(datasets.with_capacity(dataset.validation, config.collect.max_validation))
+
+    def tell(passes: int, losses: Array) -> None:
+        progress.update(passes, f"validation loss {float(np.mean(losses)):.4g}")
+
+    ensemble, info = fit(networks, normaliser, train, validation, config.fit, fit_key, tell)
+    if (survived := info.diverged & ~info.lost).any():
+        _log.warning("fit, iteration %d: %s diverged, and keep their best weights", iteration, _named(survived))
+    if info.lost.any():
+        _log.warning("fit, iteration %d: %s diverged: re-initialised and fitted again", iteration, _named(info.lost))
+        init_key, fit_key = jax.random.split(key_of(config.seed, iteration, Stage.RESET))
+        fresh = _fresh_networks(config, task, init_key)
+        ensemble, info = refit(ensemble, info, fresh, train, validation, config.fit, fit_key)
+    if info.lost.any():
+        largest = float(np.abs(dataset.train.deltas).max())
+        raise DivergedError(
+            f"fit, iteration {iteration}: {_named(info.lost)}: expected finite weights and losses, got others, twice; "
+            f"start anew with a lower fit.learning_rate than {config.fit.learning_rate}, or look for outliers in the "
+            f"data (its largest change of a state is {largest:.3g})"
+        )
+    return ensemble, info
+
+
+def _named(members: np.ndarray) -> str:
+    return f"members {', '.join(map(str, np.flatnonzero(members)))}"
 
 
 def _improve(
@@ -206,7 +235,13 @@ def _improve(
     if config.imagine.start == "anywhere":
         starts = dataset.train.states
     if config.imagine.start == "reset":
-        starts = real.reset_states(task, max(config.validate.starts, phase.rollouts(config, task)), rng)
+        with naming("improve", iteration):
+            starts = real.reset_states(task, max(config.validate.starts, phase.rollouts(config, task)), rng)
+
+    def oracle(policy: Policy) -> float:
+        with naming("validate", iteration):
+            return float(np.mean(evaluate(config, task, policy, iteration)))
+
     return phase.improve(
         config,
         task,
@@ -218,7 +253,7 @@ def _improve(
         key_of(config.seed, iteration, Stage.IMPROVE),
         clock,
         lambda updates, accepted, value: progress.update(updates, f"accepted {accepted}, imagined return {value:.2f}"),
-        lambda policy: float(np.mean(evaluate(config, task, policy, iteration))),
+        oracle,
     )
 
 
@@ -282,6 +317,7 @@ def _row(
         **{f"validation_loss_{k}": float(loss) for k, loss in enumerate(losses)},
         "train_loss": float(np.mean(fitted.train_loss)),
         "fit_passes": fitted.passes,
+        "members_reset": fitted.resets,
         "updates": improved.updates,
         "accepted_updates": improved.accepted_updates,
         "rejected_steps": improved.rejected_steps,

@@ -13,5 +13,9 @@ class TaskError(MetrpoError):
     """A task is unknown, or its environment broke its promise."""
 
 
+class DivergedError(MetrpoError):
+    """Learning has left the finite numbers for good; nothing of its iteration has been saved."""
+
+
 class RunDirectoryError(MetrpoError):
     """A run directory is in use, of another version, damaged, not writable, or holds another run."""

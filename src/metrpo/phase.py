@@ -91,7 +91,7 @@ def improve(
         infos.append(jax.device_get(info))
         updates += block
         with clock("validate"):
-            new_values, evidence = judge(policy, infos[-1][1].mean_return[-1:])
+            new_values, evidence = judge(policy, _last_return(infos[-1][1]))
         verdict = rule.decide(evidence, reference, config.validate)
         fractions.append(fraction_improved(new_values, values))
         if verdict:
@@ -122,6 +122,11 @@ def rollouts(config: Config, task: Task) -> int:
 def imagined_horizon(config: Config, task: Task) -> int:
     """Steps of an imagined episode."""
     return min(config.imagine.horizon or task.horizon, task.horizon)
+
+
+def _last_return(imagined: ImagineInfo) -> np.ndarray:
+    """[1]: of the last update's rollouts; where all of them diverged NaN, which is never an improvement."""
+    return np.where(imagined.diverged[-1:] < 1, imagined.mean_return[-1:], np.nan)
 
 
 @partial(jax.jit, static_argnames=("task", "config", "mesh"))

@@ -18,6 +18,7 @@ import numpy as np
 from metrpo.algorithm import Log, Row
 from metrpo.config import Config
 from metrpo.errors import ConfigError
+from metrpo.finite import require_finite
 from metrpo.run.directory import RunDirectory, Saved
 from metrpo.run.progress import SILENT, Progress
 from metrpo.seeds import Stage, rng_of
@@ -53,6 +54,8 @@ def step(config: Config, state: Saved, progress: Progress = SILENT, log: Log | N
     """
     logged = (log,) if config.method == "model-based" else ()
     following: tuple[Saved, Row] = import_module(METHODS[config.method]).step(config, state, progress, *logged)
+    if not logged:  # ours looks at every stage by itself
+        require_finite("learn", following[0].iteration, "lower its learning rates", state=following[0])
     return following
 
 

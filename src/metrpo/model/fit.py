@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from metrpo import devices
@@ -34,6 +35,12 @@ class FitInfo(NamedTuple):
     """[K], of the last minibatches."""
     best_pass: Array
     """[K], the pass after which each member was best."""
+    diverged: np.ndarray
+    """[K] of bool: training ended with weights or a loss that are not finite."""
+    lost: np.ndarray
+    """[K] of bool: no weights are worth keeping: the best are not finite, or training diverged and never improved."""
+    resets: int = 0
+    """Members that were lost and fitted again."""
 
 
 class _Progress(NamedTuple):
@@ -77,8 +84,52 @@ def fit(
         passes += config.validate_every
         at = _train_and_validate(at, normaliser, train, validation, config, key, jnp.int32(steps), jnp.int32(passes))
         on_validation(passes, at.best_loss)
-    info = FitInfo(passes, at.best_loss, at.train_loss, at.best_pass)
+    diverged = ~(_finite(at.networks) & np.isfinite(at.train_loss))
+    lost = ~(_finite(at.best_networks) & np.isfinite(at.best_loss)) | (diverged & (np.asarray(at.best_pass) == 0))
+    info = FitInfo(passes, at.best_loss, at.train_loss, at.best_pass, diverged, lost)
     return Ensemble(at.best_networks, normaliser), info
+
+
+def refit(
+    ensemble: Ensemble,
+    info: FitInfo,
+    fresh: Networks,
+    train: Transitions,
+    validation: Transitions,
+    config: FitConfig,
+    key: Array,
+) -> tuple[Ensemble, FitInfo]:
+    """A fitted ensemble with its lost members fitted again, by themselves, from theirs of `fresh`.
+
+    The others are bit for bit what they were.
+    """
+    lost = np.flatnonzero(info.lost)
+
+    def put(old: Array, new: Array) -> np.ndarray:
+        rows = np.array(old)
+        rows[lost] = new
+        return rows
+
+    normaliser = jax.tree.map(np.asarray, ensemble.normaliser)
+    chosen = jax.tree.map(lambda x: np.asarray(x)[lost], fresh)
+    again, second = fit(chosen, normaliser, train, validation, config, key)
+    networks = jax.tree.map(lambda old, new: jnp.asarray(put(old, new)), ensemble.networks, again.networks)
+    merged = FitInfo(
+        passes=info.passes + second.passes,
+        validation_loss=put(info.validation_loss, second.validation_loss),
+        train_loss=put(info.train_loss, second.train_loss),
+        best_pass=put(info.best_pass, second.best_pass),
+        diverged=put(info.diverged, second.diverged),
+        lost=put(info.lost, second.lost),
+        resets=len(lost),
+    )
+    return Ensemble(networks, ensemble.normaliser), merged
+
+
+def _finite(networks: Networks) -> np.ndarray:
+    """[K] of bool."""
+    leaves = [np.isfinite(np.asarray(x)) for x in jax.tree.leaves(networks)]
+    return np.all([x.all(axis=tuple(range(1, x.ndim))) for x in leaves], axis=0)
 
 
 def loss_of(ensemble: Ensemble, loss_units: str, states: Array, actions: Array, deltas: Array) -> Array:

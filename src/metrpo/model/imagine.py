@@ -20,7 +20,7 @@ Reward = Callable[[Array, Array, Array], Array]
 Terminated = Callable[[Array], Array] | Literal["learned"]
 
 EXPLODED = 1e6
-"""A rollout with a state beyond this has diverged, as has one with a state that is not finite."""
+"""A rollout with a state beyond this, or a reward beyond its square, has diverged, as has one that meets NaN."""
 
 
 class ImagineInfo(NamedTuple):
@@ -176,7 +176,7 @@ def imagine(
         following, rewards, ended = outcome(reward, terminated, states, clipped, predicted)
         if curiosity:
             rewards = rewards + curiosity * disagreement(ensemble, states, clipped)
-        bad = ~(jnp.all(jnp.abs(following) < EXPLODED, axis=-1) & jnp.isfinite(rewards))
+        bad = ~_sound(following, rewards)
         recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive)
         diverged = diverged | (bad & (alive > 0))
         if ended is not None:
@@ -194,6 +194,11 @@ def imagine(
     )
     info = ImagineInfo(total / jnp.maximum(rollouts - lost, 1), lost / rollouts, steps)
     return trajectories._replace(mask=mask, last=last, going_on=alive * (1.0 - diverged)), info
+
+
+def _sound(states: Array, rewards: Array) -> Array:
+    """[..., S], [...] -> [...]; false for NaN. A batch's squared returns stay within float32 under these bounds."""
+    return jnp.all(jnp.abs(states) < EXPLODED, axis=-1) & (jnp.abs(rewards) < EXPLODED**2)
 
 
 def returns_per_model(
@@ -220,7 +225,7 @@ def returns_per_model(
         if curiosity:
             flat = (x.reshape(-1, x.shape[-1]) for x in (states, actions))
             rewards = rewards + curiosity * disagreement(ensemble, *flat).reshape(rewards.shape)
-        sound = jnp.all(jnp.abs(following) < EXPLODED, axis=-1) & jnp.isfinite(rewards)
+        sound = _sound(following, rewards)
         # A product with `alive` would let what follows the end through: 0 * inf is NaN.
         total = total + jnp.where(alive > 0, jnp.where(sound, rewards, jnp.nan), 0.0)
         if ended is not None:

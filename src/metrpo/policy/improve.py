@@ -74,6 +74,21 @@ def batch_of(
     return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), batch), baseline
 
 
+def _sound(new: Policy, improved: ImproveInfo, imagined: Any) -> Array:
+    """Whether an update is to be made: accepted, finite, and learned from at least one step that counts."""
+    finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((new, improved.kl))]
+    return improved.accepted & (imagined.steps > 0) & jnp.all(jnp.array(finite))
+
+
+def _where(made: Array, new: Any, old: Any) -> Any:
+    return jax.tree.map(partial(jnp.where, made), new, old)
+
+
+def _reported(improved: ImproveInfo, made: Array) -> ImproveInfo:
+    kl, improvement = (jnp.where(made, x, 0.0) for x in (improved.kl, improved.improvement))
+    return improved._replace(kl=kl, improvement=improvement, accepted=made)
+
+
 def _by_score_function(step: Step) -> Improver:
     """Learns from stochastic rollouts and their advantages; never asks the models for a gradient."""
 
@@ -82,8 +97,11 @@ def _by_score_function(step: Step) -> Improver:
     ) -> tuple[Policy, Memory, Infos]:
         rollouts, imagined = simulate(partial(gaussian.sample, policy), starts, key)
         batch, baseline = batch_of(config, rollouts, memory.baseline, jax.random.fold_in(key, _VALUE), axis)
-        policy, moments, improved = step(config, policy, memory.moments, batch, jax.random.fold_in(key, _SHUFFLE), axis)
-        return policy, Memory(baseline, moments), (improved, imagined)
+        new, moments, improved = step(config, policy, memory.moments, batch, jax.random.fold_in(key, _SHUFFLE), axis)
+        sound = _sound(new, improved, imagined)
+        # A step that was rejected has been judged all the same: its rollouts fit the baseline, if there were any.
+        kept = Memory(_where(imagined.steps > 0, baseline, memory.baseline), _where(sound, moments, memory.moments))
+        return _where(sound, new, policy), kept, (_reported(improved, sound), imagined)
 
     return update
 
@@ -94,8 +112,12 @@ def _through_models(act: Callable[[Policy], Act]) -> Improver:
     def update(
         config: Config, simulate: Simulate, policy: Policy, memory: Memory, starts: Array, key: Array, axis: str | None
     ) -> tuple[Policy, Memory, Infos]:
-        new, moments, infos = bptt.improve(policy, memory.moments, act, simulate, starts, config.gradient, key, axis)
-        return new, memory._replace(moments=moments), infos
+        new, moments, (improved, imagined) = bptt.improve(
+            policy, memory.moments, act, simulate, starts, config.gradient, key, axis
+        )
+        sound = _sound(new, improved, imagined)
+        memory = memory._replace(moments=_where(sound, moments, memory.moments))
+        return _where(sound, new, policy), memory, (_reported(improved, sound), imagined)
 
     return update
 

@@ -69,7 +69,7 @@ def improve(policy: Policy, batch: Batch, config: TRPOConfig, axis: str | None =
         candidate = flat + config.backtrack_ratio**i * step
         surrogate, divergence = surrogate_and_kl(unravel(candidate))
         # Comparisons with NaN are false: a step into NaN is never accepted.
-        return (surrogate > start) & (divergence <= config.max_kl), surrogate, divergence
+        return (surrogate > start) & (surrogate < jnp.inf) & (divergence <= config.max_kl), surrogate, divergence
 
     def searching(carry: tuple[Array, tuple[Array, Array, Array]]) -> Array:
         return ~carry[1][0] & (carry[0] < config.max_backtracks - 1)

@@ -12,6 +12,14 @@ from numpy.typing import NDArray
 
 from metrpo.errors import MetrpoError, TaskError
 
+_MOST = float(np.finfo(np.float32).max) / 2
+"""Beyond this the difference of two numbers may be infinite in float32, in which everything is learned."""
+
+
+def representable(numbers: Any) -> bool:
+    """Whether all are finite, and stay so in float32 when one is taken from another."""
+    return bool(np.all(np.abs(numbers) <= _MOST))  # false for NaN
+
 
 class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     """`env` with observations flattened to [S] float64 and actions in [-1, 1], rescaled to its own range.
@@ -69,7 +77,7 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
             raise self._broken("step()", expected, result, "return all five, as Gymnasium does since 0.26")
         observation, reward, terminated, truncated, info = result
         state = self._state(observation, "step()")
-        if np.size(reward) != 1 or not np.isfinite(np.asarray(reward, np.float64)).all():
+        if np.size(reward) != 1 or not representable(np.asarray(reward, np.float64)):
             raise self._broken("step()", "one finite number as reward", reward, "return float(reward)")
         for flag, value in (("terminated", terminated), ("truncated", truncated)):
             if not isinstance(value, bool | np.bool_):
@@ -121,10 +129,10 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
             got = f"shape {list(np.shape(observation))}"
             advice = "shapes may not change within a run"
             raise self._broken(call, f"an observation of shape {list(space.shape or (self._size,))}", got, advice)
-        if not np.isfinite(state).all():
-            where = np.flatnonzero(~np.isfinite(state)).tolist()
+        if not representable(state):
+            where = next(i for i, number in enumerate(state) if not representable(number))
             advice = "end the episode before the simulation diverges, or repair the sensor"
-            raise self._broken(call, "finite numbers", f"{state[where[0]]} at index {where[0]}", advice)
+            raise self._broken(call, "finite numbers", f"{state[where]} at index {where}", advice)
         return state
 
     def _broken(self, call: str, expected: str, got: object, advice: str) -> TaskError:

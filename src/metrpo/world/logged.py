@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from pathlib import Path
 
 import numpy as np
 
 from metrpo.errors import TaskError
 from metrpo.types import Episode
+from metrpo.untrusted import arrays_of, opened
 from metrpo.world import minari_log
 from metrpo.world.task import Task
 
@@ -23,18 +22,18 @@ def load(path: str | Path, task: Task) -> list[Episode]:
     where the task, not the clock, ended the episode).
 
     An episode goes on where the next transition starts in the state in which this one ended. Files with pickled objects
-    are refused. Raises `TaskError` when the file cannot be read, lacks an array, or one does not fit the task.
+    and archives that do not hold what they claim are refused (see `metrpo.untrusted`). Raises `TaskError` when the file
+    cannot be read, lacks an array, or one does not fit the task.
     """
     if str(path).startswith(minari_log.PREFIX):
         return minari_log.load(str(path), task)
-    try:
-        with np.load(io.BytesIO(Path(path).read_bytes()), allow_pickle=False) as archive:
-            found = {name: archive[name] for name in ARRAYS if name in archive.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise TaskError(f"{path}: expected an .npz of numbers, got a file that cannot be read ({error})") from error
+    if not Path(path).exists():
+        raise TaskError(f"{path}: expected an .npz of numbers, got a file that cannot be read (there is none)")
+    with opened(Path(path), TaskError) as file:
+        found = arrays_of(file, Path(path), TaskError, compressed=True, only=ARRAYS)
     if missing := [name for name in ARRAYS if name not in found]:
         raise TaskError(f"{path}: expected the arrays {', '.join(ARRAYS)}; it lacks {', '.join(missing)}")
-    count = len(found["rewards"])
+    count = found["rewards"].size
     widths = {"states": (task.state_size,), "next_states": (task.state_size,), "actions": (task.action_size,)}
     for name, array in found.items():
         _check(f"{path}: {name}", array, (count, *widths.get(name, ())))
@@ -50,8 +49,9 @@ def _check(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
     if array.shape != shape or array.dtype.kind not in "biuf":
         expected, got = list(shape), list(array.shape)
         raise TaskError(f"{name}: expected numbers of shape {expected}, got {array.dtype} of shape {got}")
-    if not np.isfinite(array).all():
-        raise TaskError(f"{name}: expected finite numbers, got some that are not; leave these transitions out")
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold counts as infinite
+        if not np.isfinite(array.astype(np.float32)).all():
+            raise TaskError(f"{name}: expected finite numbers, got some that are not; leave these transitions out")
 
 
 def _episodes(found: dict[str, np.ndarray]) -> list[Episode]:
