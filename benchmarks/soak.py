@@ -57,7 +57,8 @@ def soak(run_dir: Path, hours: float, kills: int, command: list[str]) -> None:
     """Trains for `hours`, killed `kills` times."""
     run_dir.parent.mkdir(parents=True, exist_ok=True)
     log, said = Log(run_dir), run_dir.with_name(f"{run_dir.name}-soak.log")
-    moments = [*sorted(random.Random(0).uniform(0, hours) for _ in range(kills)), hours]
+    rng = random.Random(0)
+    moments = [*sorted(rng.uniform(0, hours) for _ in range(kills)), hours]
     done = [float(event["hours"]) for event in log.events]
     cpu = [float(event["cpu_hours"]) for event in log.events]
     hours_before, cpu_before = max(done, default=0.0), max(cpu, default=0.0)

@@ -345,4 +345,5 @@ def test_a_stopped_run_says_how_to_go_on(number, code):
         process.send_signal(number)
         _, err = process.communicate(timeout=30)
     assert process.returncode == code
-    assert err == "metrpo: stopped; a keeps every finished iteration. The same command goes on.\n"
+    kept = "a keeps every finished iteration and real episode. The same command goes on."
+    assert err == f"metrpo: stopped; {kept}\n\n  metrpo train Swimmer --run-dir a\n\n"

@@ -66,12 +66,10 @@ def test_events_hold_every_iteration_once_after_a_resume(tmp_path):
     rows = [{"iteration": i, "real_steps": 100 * i, "gap": math.nan if i == 1 else 0.5 * i} for i in (1, 2, 3)]
     first = Events(tmp_path, rows[:1])
     first.add(rows[1])
-    first.close()
     (written,) = tmp_path.iterdir()
     written.rename(tmp_path / "events.out.tfevents.1.elsewhere")  # the name holds the second in which it was written
     second = Events(tmp_path, rows[:2])
     second.add(rows[2])
-    second.close()
     expected = [("gap", 200, 1.0), ("gap", 300, 1.5)]
     expected += [(name, 100 * i, row[name]) for i, row in enumerate(rows, 1) for name in ("iteration", "real_steps")]
     assert scalars(tmp_path) == sorted(expected)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
 import math
 import types
@@ -16,6 +17,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from metrpo.errors import ConfigError
+from metrpo.untrusted import brief, json_of
 
 
 def _require(condition: bool, name: str, value: object, expected: str) -> None:
@@ -407,13 +409,10 @@ def to_json(config: Config) -> str:
 def from_json(text: str) -> Config:
     """The config that `to_json` wrote.
 
-    Raises `ConfigError` when the text is no JSON, a setting is missing, unknown, of the wrong type or impossible.
+    Raises `ConfigError` when the text is no JSON, a setting is missing, unknown, twice there, of the wrong type or
+    impossible.
     """
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ConfigError(f"config: expected JSON, got something else ({error})") from None
-    return _build(Config, data, "config")
+    return _build(Config, json_of(text, "config", ConfigError), "config")
 
 
 def flatten(config: Config) -> dict[str, Any]:
@@ -447,15 +446,18 @@ def _nonnegative(value: float) -> bool:
     return math.isfinite(value) and value >= 0
 
 
+_hints = functools.cache(typing.get_type_hints)
+
+
 def _build(cls: type, data: object, where: str) -> Any:
     if not isinstance(data, dict):
-        raise ConfigError(f"{where}: expected an object with its settings, got {data!r}")
-    hints = typing.get_type_hints(cls)
+        raise ConfigError(f"{where}: expected an object with its settings, got {brief(data)}")
+    hints = _hints(cls)
     names = [f.name for f in dataclasses.fields(cls)]
     missing = [n for n in names if n not in data and f"{where}.{n}" not in ADDED]
-    wrong = [f"missing {n}" for n in missing] + [f"unknown {n}" for n in data if n not in names]
+    wrong = [f"missing {n}" for n in missing] + [f"unknown {brief(n)[1:-1]}" for n in data if n not in names]
     if wrong:
-        raise ConfigError(f"{where}: expected exactly the settings of this version, got {', '.join(wrong)}")
+        raise ConfigError(f"{where}: expected exactly the settings of this version, got {', '.join(wrong[:40])}")
     return cls(**{name: convert(hints[name], data[name], f"{where}.{name}") for name in names if name in data})
 
 
@@ -471,15 +473,17 @@ def convert(kind: Any, value: Any, where: str) -> Any:
         return None if value is None else convert(arguments[0], value, where)
     if origin is Literal:
         if value not in arguments:
-            raise ConfigError(f"{where}: expected one of {', '.join(map(str, arguments))}, got {value!r}")
+            raise ConfigError(f"{where}: expected one of {', '.join(map(str, arguments))}, got {brief(value)}")
         return value
     if origin is tuple:
         if not isinstance(value, list | tuple):
-            raise ConfigError(f"{where}: expected a list, got {value!r}")
+            raise ConfigError(f"{where}: expected a list, got {brief(value)}")
         return tuple(convert(arguments[0], item, where) for item in value)
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         with contextlib.suppress(OverflowError):
             return float(value)
+    if type(value) is int and abs(value) >= 2**63:
+        raise ConfigError(f"{where}: expected less than 2^63, got {brief(value)}")
     if type(value) is not kind:
-        raise ConfigError(f"{where}: expected {kind.__name__}, got {value!r}")
+        raise ConfigError(f"{where}: expected {kind.__name__}, got {brief(value)}")
     return value

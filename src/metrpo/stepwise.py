@@ -10,6 +10,7 @@ Each step leaves the run directory as `train` does, which may go on with it, and
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 from metrpo import algorithm
@@ -43,14 +44,20 @@ def collect(
     """Adds real episodes to those that wait, and returns all that do.
 
     Plays the environment with exploration until the waiting episodes have `at_least` steps (default: the config's
-    `collect.steps`), or reads a log (see `world.logged`). Raises `RunDirectoryError` when `run_dir` holds no run.
+    `collect.steps`), or reads a log (see `world.logged`) and adds what does not wait yet.
+
+    Raises `RunDirectoryError` when `run_dir` holds no run.
     """
     config = stored_config(run_dir)
     with RunDirectory(run_dir, config) as run:
         state = _state(run, config)
         if data is not None:
+            waiting = Counter(map(_content, run.episodes.pending()))
             for episode in logged.load(data, algorithm.task_for(config)):
-                run.episodes.append(episode)
+                if waiting[_content(episode)]:  # added already, when this was stopped half-way
+                    waiting[_content(episode)] -= 1
+                else:
+                    run.episodes.append(episode)
             return run.episodes.pending()
         wanted = config.collect.steps if at_least is None else at_least
         progress.begin(state.iteration + 1, None)
@@ -81,6 +88,10 @@ def improve(run_dir: str | Path, progress: Progress = SILENT) -> Row:
         finally:
             progress.close()
     return written
+
+
+def _content(episode: Episode) -> tuple[bytes | bool, ...]:
+    return episode.states.tobytes(), episode.actions.tobytes(), episode.rewards.tobytes(), episode.terminated
 
 
 def _ours(config: Config) -> State:

@@ -71,8 +71,8 @@ def runs_there(figure: str, scale: str, tasks: tuple[str, ...], out: Path) -> li
 def reproduce(runs: list[Run], out: Path, jobs: int, tell: Tell) -> list[Run]:
     """Runs all that is not finished, `jobs` at a time on cores of their own, and returns those that failed.
 
-    Started anew it goes on where it was stopped. Ctrl-C or SIGTERM stops the runs too, each with its last iteration
-    saved.
+    Started anew it goes on where it was stopped. Ctrl-C or SIGTERM stops the runs too, each with its iteration
+    saved; once more stops them at once.
 
     Raises `MetrpoError` when `out` cannot be written.
     """
@@ -98,11 +98,26 @@ def reproduce(runs: list[Run], out: Path, jobs: int, tell: Tell) -> list[Run]:
                 for child in children:
                     tell(f"  {child.run.name}: {_standing(child.run, out)}")
     finally:
-        for child in children:
-            child.process.terminate()
-        for child in children:
-            child.process.wait()
+        _stop(children, tell)
     return failed
+
+
+def _stop(children: list[_Child], tell: Tell) -> None:
+    """Ends the runs: asked once, each finishes its iteration; when this is interrupted, it asks them once more."""
+    if children:
+        tell(f"stopping {len(children)} runs after their iteration; once more stops them at once")
+    try:
+        _ask_to_stop(children)
+    except BaseException:
+        _ask_to_stop(children)
+        raise
+
+
+def _ask_to_stop(children: list[_Child]) -> None:
+    for child in children:
+        child.process.terminate()
+    for child in children:
+        child.process.wait()
 
 
 def _start(run: Run, out: Path, cores: tuple[int, ...]) -> _Child:

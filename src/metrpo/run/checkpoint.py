@@ -12,6 +12,7 @@ import numpy as np
 
 from metrpo.errors import RunDirectoryError
 from metrpo.run.files import read_arrays, write_arrays
+from metrpo.untrusted import brief
 
 Tree = TypeVar("Tree")
 
@@ -29,7 +30,8 @@ def load_state(path: Path, template: Tree) -> tuple[Tree, dict[str, Any]]:
     """The pytree and the `meta` that `save_state` wrote.
 
     `template` gives the structure, kinds and dtypes: NumPy leaves come back as NumPy arrays, JAX leaves as JAX arrays,
-    plain numbers as plain numbers. Shapes are the file's own: a dataset may have grown.
+    plain numbers as plain numbers. Shapes are the template's but for the first axis of NumPy arrays, which is the
+    file's own: a dataset may have grown.
 
     Raises `DamagedFile` when the file is truncated or edited, `RunDirectoryError` when it is of another format or
     holds another structure.
@@ -45,8 +47,8 @@ def load_state(path: Path, template: Tree) -> tuple[Tree, dict[str, Any]]:
         more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
         raise RunDirectoryError(
             f"{path} does not fit this run: expected {len(expected)} arrays, got {len(arrays)}; "
-            f"it {'; it '.join(wrong[:3])}{more}. It was written by metrpo {meta['metrpo']}: use that version, "
-            "or another directory"
+            f"it {'; it '.join(wrong[:3])}{more}. It was written by metrpo {brief(meta.get('metrpo'))}: use that "
+            "version, or another directory"
         )
     leaves = [_like(leaf, arrays[name]) for name, leaf in expected.items()]
     return jax.tree.unflatten(jax.tree.structure(template), leaves), meta
@@ -58,9 +60,13 @@ def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
 
 def _mismatch(name: str, leaf: Any, array: np.ndarray) -> str:
     kind, rank = (leaf.dtype, leaf.ndim) if hasattr(leaf, "dtype") else (np.asarray(leaf).dtype, 0)
-    if (kind, rank) == (array.dtype, array.ndim):
-        return ""
-    return f"has {name} as {array.dtype} of rank {array.ndim} instead of {kind} of rank {rank}"
+    if (kind, rank) != (array.dtype, array.ndim):
+        return f"has {name} as {array.dtype} of rank {array.ndim} instead of {kind} of rank {rank}"
+    grows = isinstance(leaf, np.ndarray)
+    expected = np.shape(leaf)
+    if expected[grows:] != array.shape[grows:]:
+        return f"has {name} of shape {list(array.shape)} instead of {['n', *expected[1:]] if grows else list(expected)}"
+    return ""
 
 
 def _like(leaf: Any, array: np.ndarray) -> Any:

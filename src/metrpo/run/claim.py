@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import json
 import os
@@ -14,7 +15,8 @@ from typing import TextIO
 from metrpo import config as configs
 from metrpo.config import Config
 from metrpo.errors import ConfigError, RunDirectoryError
-from metrpo.run.files import FORMAT, atomic_write, check_format, metrpo_version, source_commit
+from metrpo.run.files import FORMAT, atomic_write, check_format, make_directory, metrpo_version, source_commit
+from metrpo.untrusted import json_of, text_of
 
 
 def claim(path: Path, config: Config) -> TextIO:
@@ -36,7 +38,7 @@ def claim(path: Path, config: Config) -> TextIO:
 
 def _create(path: Path) -> None:
     try:
-        path.mkdir(parents=True, exist_ok=True)
+        make_directory(path)
         foreign = [p.name for p in path.iterdir() if p.name != ".lock" and ".tmp" not in p.name]
     except OSError as error:
         raise RunDirectoryError(
@@ -52,31 +54,33 @@ def _create(path: Path) -> None:
 def _lock(path: Path) -> TextIO:
     # The kernel drops the lock when the process ends, however it ends: no stale locks to clean up.
     try:
-        file = open(path / ".lock", "a+")  # noqa: SIM115 - it stays open as long as the run
+        file = open(path / ".lock", "a+", errors="replace")  # noqa: SIM115 - it stays open as long as the run
     except OSError as error:
         raise RunDirectoryError(f"cannot write in {path}: {error.strerror}; choose a writable directory") from error
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except BlockingIOError:
         file.seek(0)
-        holder = file.read().strip() or "unknown"
+        holder = file.read(20).strip() or "unknown"
         file.close()
         raise RunDirectoryError(
             f"{path} is in use by another process (pid {holder}): wait for it, end it, or choose another directory"
         ) from None
-    file.truncate(0)
-    file.write(str(os.getpid()))
-    file.flush()
+    except OSError as error:
+        file.close()
+        raise RunDirectoryError(f"cannot lock {path}: {error.strerror}; choose a directory on another disk") from error
+    with contextlib.suppress(OSError):  # on a full disk it holds all the same, and only does not say whose it is
+        os.ftruncate(file.fileno(), 0)
+        os.write(file.fileno(), str(os.getpid()).encode())
     return file
 
 
 def _check_or_describe(file: Path) -> None:
     if file.exists():
-        try:
-            about = json.loads(file.read_text())
-            check_format(dict(about), file)
-        except (ValueError, TypeError, OSError) as error:
-            raise RunDirectoryError(f"{file} is damaged ({error}): put it back or choose another directory") from None
+        about = json_of(text_of(file, RunDirectoryError), f"{file} is damaged", RunDirectoryError)
+        if not isinstance(about, dict):
+            raise RunDirectoryError(f"{file} is damaged (no object): put it back or choose another directory")
+        check_format(about, file)
         return
     about = {"format": FORMAT, "metrpo": metrpo_version(), "commit": source_commit()}
     about["python"] = platform.python_version()
@@ -92,13 +96,13 @@ def _check_or_write_config(file: Path, config: Config, started: bool) -> None:
         atomic_write(file, configs.to_json(config))
         return
     try:
-        stored = configs.from_json(file.read_text())
-    except (ConfigError, UnicodeDecodeError) as error:
+        stored = configs.from_json(text_of(file, ConfigError))
+    except ConfigError as error:
         raise RunDirectoryError(f"{file} is damaged: {error}; put it back or choose another directory") from None
     require_same(stored, config, file)
 
 
-def require_same(stored: Config, asked: Config, where: Path) -> None:
+def require_same(stored: Config, asked: Config, where: Path | str) -> None:
     """Raises `RunDirectoryError` with a table of the settings in which `where` differs from what was asked for."""
     changed = configs.difference(stored, asked)
     if changed:

@@ -12,13 +12,18 @@ and again when the run is resumed, so that a kill at any moment leaves nothing t
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import re
+import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, Self, TypeVar
+
+import jax
+import numpy as np
 
 from metrpo import config as configs
 from metrpo.config import Config
@@ -26,13 +31,16 @@ from metrpo.errors import ConfigError, RunDirectoryError
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.claim import claim, require_same
 from metrpo.run.episodes import EpisodeLog
-from metrpo.run.files import DamagedFile, atomic_write
-from metrpo.run.metrics import Events, Row, plain, read_metrics, to_csv, without_clocks
+from metrpo.run.files import DamagedFile, atomic_write, writing
+from metrpo.run.metrics import Events, Row, checked, completed, plain, read_metrics, to_csv, without_clocks
 from metrpo.run.policy_file import Weights, save_policy
 from metrpo.run.report import draw_curve
+from metrpo.untrusted import text_of
 
 _log = logging.getLogger("metrpo")
 _KEPT = 2
+_PATIENCE = 120.0
+"""Seconds for what is derived from a checkpoint; the first curve ever drawn on a machine looks for its fonts."""
 
 
 class Saved(Protocol):
@@ -74,7 +82,7 @@ class RunDirectory:
     def __init__(self, path: str | Path, config: Config) -> None:
         self.path, self.config, self.rows = Path(path), config, []
         self._lock = claim(self.path, config)
-        self.episodes, self._taken = EpisodeLog(self.path), [0]
+        self.episodes, self._taken = EpisodeLog(self.path, writer="run"), [0]
         self._opened, self._wall_seconds_before = time.monotonic(), 0.0
         self._events: Events | None = None
         self._failed: set[str] = set()
@@ -87,8 +95,6 @@ class RunDirectory:
 
     def close(self) -> None:
         """Lets go of the directory."""
-        if self._events is not None:
-            self._derive("TensorBoard events", self._events.close)
         self._lock.close()
 
     def load(self, template: State) -> State | None:
@@ -100,11 +106,14 @@ class RunDirectory:
         Raises `RunDirectoryError` when no checkpoint is sound, or it is of another structure or version.
         """
         found = self._checkpoints()
+        layers = template.policy.layers
+        self.episodes.widths = (layers[0][0].shape[0], layers[-1][0].shape[1])
         if not found:
             self._require_fresh()
             self._write_config()
             return None
         state, meta = self._load_newest(found, template)
+        self._look_for_more(found[-1])
         self.rows = meta["rows"]
         self._wall_seconds_before = (self.rows[-1]["wall_seconds"] or 0.0) if self.rows else 0.0
         self.episodes.start(after=meta.get("episodes", 0))
@@ -132,14 +141,14 @@ class RunDirectory:
         elapsed = self._wall_seconds_before + time.monotonic() - self._opened
         written = plain({**row, "wall_seconds": round(elapsed, 3)})
         written = without_clocks(written) if self.config.deterministic else written
-        rows = [*self.rows, written]
+        rows = [*(completed(row, written) for row in self.rows), written]
         to_csv(rows)  # columns that differ are an error before anything is written
         self._write_checkpoint(state, rows, taken=self.episodes.read)
         self.rows = rows
         self.episodes.start(after=self.episodes.read)
         self._taken = [*self._taken, self.episodes.taken][-_KEPT:]
-        self.episodes.forget(before=self._taken[0])
         self._publish(state)
+        self.episodes.forget(before=self._taken[0])  # last: the checkpoint that would need them is gone
         return written
 
     def _load_newest(self, found: list[Path], template: State) -> tuple[State, dict[str, Any]]:
@@ -148,13 +157,15 @@ class RunDirectory:
         for path in reversed(found):
             try:
                 state, meta = load_state(path, template)
+                _check(path, state, meta)
             except DamagedFile as error:
                 damaged.append((path, error))
                 continue
-            require_same(configs.from_json(meta["config"]), self.config, path)
+            require_same(_config(path, meta), self.config, f"{path}, unlike config.json,")
             for old, why in damaged:
                 _log.warning("%s; going on from %s, the damaged file is kept as %s.damaged", why, path.name, old.name)
-                old.rename(old.with_name(f"{old.name}.damaged"))
+                with writing(aside := old.with_name(f"{old.name}.damaged")):
+                    old.rename(aside)
             return state, meta
         what = " and ".join(str(why) for _, why in damaged)
         raise DamagedFile(
@@ -169,7 +180,7 @@ class RunDirectory:
 
     def _checkpoints(self) -> list[Path]:
         names = (self.path / "checkpoints").glob("iteration-*.npz")
-        return sorted(n for n in names if re.fullmatch(r"iteration-\d{5,}", n.stem))
+        return sorted((n for n in names if re.fullmatch(r"iteration-[0-9]{5,18}", n.stem)), key=_number)
 
     def _require_fresh(self) -> None:
         metrics = self.path / "metrics.csv"
@@ -180,13 +191,22 @@ class RunDirectory:
                 "got none; put the files back or choose another directory"
             )
 
+    def _look_for_more(self, newest: Path) -> None:
+        # A row is written after its checkpoint; what cannot be read is written anew in any case.
+        with contextlib.suppress(RunDirectoryError):
+            finished = len(read_metrics(self.path / "metrics.csv"))
+            if finished > _number(newest):
+                lost = f"iteration-{finished:05d}.npz"
+                _log.warning("%s has lost its checkpoint %s: going on from an earlier one", self.path, lost)
+
     def _write_config(self) -> None:
         # The budget may be another one than last time.
         atomic_write(self.path / "config.json", configs.to_json(self.config))
 
     def _publish(self, state: Saved) -> None:
         for old in self._checkpoints()[:-_KEPT]:
-            old.unlink()
+            with contextlib.suppress(OSError):  # costs room only
+                old.unlink()
         result = self.rows[-1].get("return_real") if self.rows else None
         result = result if result is not None and math.isfinite(result) else None
         if self.rows:
@@ -199,20 +219,69 @@ class RunDirectory:
         self._derive("TensorBoard events", self._write_events)
 
     def _write_events(self) -> None:
-        if self._events is None:
+        if self._events is None or not self._events.path.exists():
             self._events = Events(self.path / "events", self.rows)
         else:
             self._events.add(self.rows[-1])
 
     def _derive(self, what: str, write: Callable[[], None]) -> None:
-        # A picture that cannot be drawn must not cost hours of training.
+        # A picture that cannot be drawn, or is never finished, must not cost hours of training.
         if what in self._failed:
             return
         try:
-            write()
+            _within(_PATIENCE, write)
         except Exception as error:
             self._failed.add(what)
             _log.warning("no %s from here on (%s: %s); training goes on", what, type(error).__name__, error)
+
+
+def _within(seconds: float, act: Callable[[], None]) -> None:
+    """Calls `act`; `TimeoutError` when it takes longer, and is left behind. It must touch nothing that others need."""
+    raised: list[BaseException] = []
+
+    def attempt() -> None:
+        try:
+            act()
+        except BaseException as error:
+            raised.append(error)
+
+    thread = threading.Thread(target=attempt, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if thread.is_alive():
+        raise TimeoutError(f"not finished within {seconds:g} s")
+    if raised:
+        raise raised[0]
+
+
+def _number(path: Path) -> int:
+    return int(path.stem.removeprefix("iteration-"))
+
+
+def _config(path: Path, meta: Mapping[str, Any]) -> Config:
+    text = meta.get("config")
+    try:
+        return configs.from_json(text if isinstance(text, str) else "")
+    except ConfigError as error:
+        raise RunDirectoryError(f"{path} does not fit this version: {error}; choose another directory") from None
+
+
+def _check(path: Path, state: Saved, meta: Mapping[str, Any]) -> None:
+    """Holds a checkpoint's name, state and record against each other, for files are renamed, and copied by hand.
+
+    Raises `DamagedFile` when it is another iteration's, `RunDirectoryError` when no run can have written it.
+    """
+    if state.iteration != _number(path):
+        raise DamagedFile(f"{path} is damaged (renamed): expected iteration {_number(path)}, got {state.iteration}")
+    episodes = meta.get("episodes", 0)
+    try:
+        checked(meta.get("rows"), state.iteration)
+        if type(episodes) is not int or episodes < 0 or state.real_steps < 0:
+            raise ValueError("expected counts of episodes and real steps")
+        if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state)):
+            raise ValueError("expected finite numbers, got some that are infinite or NaN")
+    except ValueError as error:
+        raise RunDirectoryError(f"{path} holds no state to go on from: {error}; choose another directory") from None
 
 
 def stored_config(run_dir: str | Path) -> Config:
@@ -222,10 +291,10 @@ def stored_config(run_dir: str | Path) -> Config:
     """
     file = Path(run_dir) / "config.json"
     try:
-        return configs.from_json(file.read_text())
-    except FileNotFoundError:
-        raise RunDirectoryError(
-            f"{run_dir} holds no run: expected {file}; start one with: metrpo init TASK --run-dir {run_dir}"
-        ) from None
-    except (OSError, ConfigError, UnicodeDecodeError) as error:
+        if not file.exists():
+            raise RunDirectoryError(
+                f"{run_dir} holds no run: expected {file}; start one with: metrpo init TASK --run-dir {run_dir}"
+            )
+        return configs.from_json(text_of(file, ConfigError))
+    except (OSError, ConfigError) as error:
         raise RunDirectoryError(f"{file} cannot be read: {error}; put it back or choose another directory") from None

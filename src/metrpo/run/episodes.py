@@ -8,8 +8,11 @@ The checkpoint of an iteration says how many it has learned from; their files go
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import os
 import re
+import secrets
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,16 +20,22 @@ from typing import Any
 import numpy as np
 
 from metrpo.errors import RunDirectoryError, TaskError
-from metrpo.run.files import read_arrays, sync_directory, write_arrays
+from metrpo.run.files import read_arrays, sync_directory, write_arrays, writing
 from metrpo.run.policy_file import load_policy
 from metrpo.types import Episode
+from metrpo.untrusted import brief
+
+_log = logging.getLogger("metrpo")
 
 
 class EpisodeLog:
     """The episodes of one run directory (see above)."""
 
-    def __init__(self, run_dir: Path) -> None:
-        self._folder = run_dir / "episodes"
+    def __init__(self, run_dir: Path, writer: str | None = None) -> None:
+        # The name of the only writer there is may come again, over what a kill has left; others are never the same.
+        self._folder, self._writer = run_dir / "episodes", writer or f"{os.getpid()}-{secrets.token_hex(4)}"
+        self.widths: tuple[int, int] | None = None
+        """How many numbers a state and an action of this run have, where that is known."""
         self.start(after=0)
 
     def start(self, after: int) -> None:
@@ -43,6 +52,9 @@ class EpisodeLog:
         """
         numbers = [n for n in self._numbers() if n >= self.taken]
         self.read = max([self.taken, *(n + 1 for n in numbers)])
+        if lost := self.read - self.taken - len(numbers):
+            span = f"{self.taken:08d} and {self.read - 1:08d}"
+            _log.warning("%s: %d real episodes between %s are gone; going on without them", self._folder, lost, span)
         return [self._load(n) for n in numbers]
 
     def append(self, episode: Episode) -> Path:
@@ -53,31 +65,33 @@ class EpisodeLog:
         number = max([self.taken, *(n + 1 for n in self._numbers())])
         arrays = {**episode._asdict(), "terminated": np.bool_(episode.terminated)}
         arrays = {name: np.asarray(array) for name, array in arrays.items()}
-        mine = self._folder / f"from-{os.getpid()}.npz"
-        write_arrays(mine, arrays, {})
+        mine = self._folder / f"from-{self._writer}.npz"
         try:
-            while True:
-                try:
-                    os.link(mine, path := self._path(number))  # unlike a rename, it never replaces another's episode
-                    sync_directory(self._folder)
-                    break
-                except FileExistsError:
-                    number += 1
-        except OSError as error:
-            raise RunDirectoryError(f"cannot write {path}: {error.strerror or error}") from error
+            with writing(self._path(number)):
+                while True:
+                    write_arrays(mine, arrays, {"number": number})
+                    try:
+                        os.link(mine, self._path(number))  # unlike a rename, it never replaces another's episode
+                        break
+                    except FileExistsError:
+                        number += 1
+                sync_directory(self._folder)
         finally:
-            mine.unlink()
+            with contextlib.suppress(OSError):  # the episode is there, or not: what is left besides does no harm
+                mine.unlink()
         self.read = number + 1
-        return path
+        return self._path(number)
 
     def forget(self, before: int) -> None:
         """Deletes the episodes with smaller numbers; the last of all stays, for whoever appends numbers from it on."""
         for number in self._numbers()[:-1]:
             if number < before:
-                self._path(number).unlink(missing_ok=True)
+                with contextlib.suppress(OSError):  # costs room only
+                    self._path(number).unlink()
 
     def _numbers(self) -> list[int]:
-        found = (re.fullmatch(r"(\d{8,})\.npz", path.name) for path in self._folder.glob("*.npz"))
+        # Each number has one name only, so that no episode counts twice.
+        found = (re.fullmatch(r"([0-9]{8}|[1-9][0-9]{8,17})\.npz", path.name) for path in self._folder.glob("*.npz"))
         return sorted(int(match[1]) for match in found if match)
 
     def _path(self, number: int) -> Path:
@@ -85,11 +99,30 @@ class EpisodeLog:
 
     def _load(self, number: int) -> Episode:
         path = self._path(number)
-        arrays, _ = read_arrays(path)
+        arrays, meta = read_arrays(path)
+        # Under another's number, it would be learned from twice, and the other one lost.
+        if (own := meta.get("number", number)) != number:
+            raise RunDirectoryError(
+                f"{path} was renamed: expected episode {number}, got {brief(own)}; put it back where it was, or hand "
+                "over its arrays with metrpo.append_episode"
+            )
         try:
-            return Episode(arrays["states"], arrays["actions"], arrays["rewards"], bool(arrays["terminated"]))
-        except (KeyError, ValueError) as error:
-            raise RunDirectoryError(f"{path} holds no episode ({error}); delete it to go on without") from error
+            return self._checked(arrays)
+        except ValueError as error:
+            raise RunDirectoryError(f"{path} holds no episode of this run ({error}); move it away to go on") from None
+
+    def _checked(self, arrays: dict[str, np.ndarray]) -> Episode:
+        if set(arrays) != set(Episode._fields):
+            raise ValueError(f"expected {', '.join(Episode._fields)}, got {brief(list(arrays))}")
+        steps = arrays["rewards"].size
+        states, actions = self.widths or (array.shape[-1] if array.ndim else 0 for array in list(arrays.values())[:2])
+        shapes = {"states": (steps + 1, states), "actions": (steps, actions), "rewards": (steps,), "terminated": ()}
+        for name, array in arrays.items():
+            if array.shape != shapes[name] or steps == 0:
+                raise ValueError(f"{name}: expected shape {list(shapes[name])}, got {list(array.shape)}")
+            if array.dtype != (bool if name == "terminated" else np.float32) or not np.isfinite(array).all():
+                raise ValueError(f"{name}: expected finite numbers of float32, got {array.dtype} or others")
+        return Episode(arrays["states"], arrays["actions"], arrays["rewards"], bool(arrays["terminated"]))
 
 
 def append_episode(

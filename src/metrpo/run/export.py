@@ -11,7 +11,6 @@ import json
 import textwrap
 from collections.abc import Callable
 from dataclasses import asdict
-from itertools import pairwise
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -21,6 +20,7 @@ import numpy as np
 from metrpo.errors import MetrpoError, RunDirectoryError
 from metrpo.run.files import atomic_write, metrpo_version
 from metrpo.run.policy_file import FILE, LoadedPolicy, load_policy
+from metrpo.untrusted import opened
 
 _Writer = Callable[[LoadedPolicy, Path], bytes | str]
 _OPSET = 13
@@ -40,24 +40,16 @@ def export(run_dir: Path, out: Path | None = None) -> Path:
     if out.suffix not in _WRITERS:
         raise MetrpoError(f"{out}: expected a name that ends in {', '.join(_WRITERS)}; got {out.suffix or 'no ending'}")
     policy = load_policy(run_dir)
-    _check(policy, source)
-    if out.suffix == ".py" and out.is_file() and not out.read_text(errors="replace").startswith(_SOURCE[:40]):
+    if out.suffix == ".py" and out.is_file() and not _is_ours(out):
         raise MetrpoError(f"{out} exists and is no exported policy: choose another name, or remove it first")
     atomic_write(out, _WRITERS[out.suffix](policy, source))
     return out
 
 
-def _check(policy: LoadedPolicy, source: Path) -> None:
-    info = policy.info
-    sizes = (info.observation_size, *info.hidden, info.action_size)
-    if info.activation != "tanh":
-        raise RunDirectoryError(f"{source}: expected hidden layers with tanh, got {info.activation!r}")
-    expected = [((inputs, outputs), (outputs,)) for inputs, outputs in pairwise(sizes)]
-    found = [(weights.shape, bias.shape) for weights, bias in policy.layers]
-    if found != expected:
-        raise RunDirectoryError(f"{source}: expected weights and biases of shapes {expected}, got {found}")
-    if not all(np.isfinite(array).all() for layer in policy.layers for array in layer):
-        raise RunDirectoryError(f"{source}: expected finite weights, got infinite or NaN; export an earlier policy")
+def _is_ours(path: Path) -> bool:
+    start = _SOURCE[:40].encode()
+    with opened(path, RunDirectoryError) as file:
+        return file.read(len(start)) == start
 
 
 def _info(policy: LoadedPolicy, source: Path) -> dict[str, Any]:

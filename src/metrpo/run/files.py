@@ -14,14 +14,15 @@ import os
 import re
 import subprocess
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from metrpo.errors import RunDirectoryError
+from metrpo.untrusted import LARGEST_FILE, LARGEST_TEXT, arrays_of, brief, json_of, opened
 
 FORMAT = 1
 """Raised whenever a file of a run directory changes its meaning; other formats are refused by name."""
@@ -40,17 +41,27 @@ def atomic_write(path: Path, content: bytes | str) -> None:
     Raises `RunDirectoryError` when it cannot be written.
     """
     temporary = temporary_path(path)
+    with writing(path):
+        try:
+            make_directory(path.parent)
+            with open(temporary, "wb") as file:
+                file.write(content.encode() if isinstance(content, str) else content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+            sync_directory(path.parent)
+        except OSError:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            raise
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Raises `RunDirectoryError` where `path` cannot be written in this block."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(temporary, "wb") as file:
-            file.write(content.encode() if isinstance(content, str) else content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-        sync_directory(path.parent)
+        yield
     except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
         raise RunDirectoryError(
             f"cannot write {path}: {error.strerror or error}; make room or choose a writable directory"
         ) from error
@@ -80,40 +91,45 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str
     with zipfile.ZipFile(buffer, "a") as archive:
         archive.comment = b"0" * _DIGEST_SIZE
     body = buffer.getvalue()[:-_DIGEST_SIZE]
+    if len(body) > LARGEST_FILE - _DIGEST_SIZE or len(text) > LARGEST_TEXT:
+        raise RunDirectoryError(
+            f"cannot write {path}: {len(body):,} bytes would not be read again; keep fewer transitions"
+        )
     atomic_write(path, body + _digest(body))
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the `meta` that `write_arrays` wrote.
 
-    Raises `DamagedFile` when the file is not byte for byte as written, `RunDirectoryError` when it cannot be read
-    or is of another format.
+    Raises `DamagedFile` when the file is not byte for byte as written, `RunDirectoryError` when it cannot be read,
+    is of another format, or was made to look like one of ours (see `metrpo.untrusted`).
     """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise RunDirectoryError(f"cannot read {path}: {error.strerror or error}") from error
-    body, found = content[:-_DIGEST_SIZE], content[-_DIGEST_SIZE:]
-    expected = _digest(body)
-    if found != expected:
-        got = found.decode("ascii", "backslashreplace")[:16] or "nothing"
-        raise DamagedFile(
-            f"{path} is damaged (truncated or edited): expected SHA-256 {expected.decode()[:16]} at its end, got {got}"
-        )
-    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    meta = json.loads(arrays.pop(_META).tobytes())
+    with opened(path, RunDirectoryError) as file:
+        found, expected = _digests(file)
+        if found != expected:
+            got = ascii(found[:16].decode("latin-1"))[1:-1] or "nothing"
+            raise DamagedFile(
+                f"{path} is damaged (truncated or edited): expected SHA-256 {expected.decode()[:16]} at its end, "
+                f"got {got}"
+            )
+        arrays = arrays_of(file, path, RunDirectoryError, compressed=False)
+    text = arrays.pop(_META, None)
+    if text is None or text.dtype != np.uint8:
+        raise RunDirectoryError(f"{path}: expected {_META} in it, as text, got none")
+    meta = json_of(text.tobytes(), f"{path}: {_META}", RunDirectoryError)
+    if not isinstance(meta, dict):
+        raise RunDirectoryError(f"{path}: {_META}: expected an object, got {type(meta).__name__}")
     check_format(meta, path)
     return arrays, meta
 
 
 def check_format(meta: Mapping[str, Any], path: Path) -> None:
     """Raises `RunDirectoryError` when `path`, whose `meta` says how it was written, is of another format than ours."""
-    if meta.get("format") != FORMAT:
-        writer = meta.get("metrpo", "of another version")
+    if type(meta.get("format")) is not int or meta["format"] != FORMAT:
+        writer = str(meta.get("metrpo", "of another version"))[:100]
         raise RunDirectoryError(
-            f"{path} has format {meta.get('format')} (written by metrpo {writer}), but metrpo {metrpo_version()} reads "
-            f"format {FORMAT}: use metrpo {writer}, or another directory"
+            f"{path} has format {brief(meta.get('format'))} (written by metrpo {writer}), "
+            f"but metrpo {metrpo_version()} reads format {FORMAT}: use metrpo {writer}, or another directory"
         )
 
 
@@ -145,6 +161,29 @@ def _git(directory: Path, *arguments: str) -> str:
 
 def _digest(body: bytes) -> bytes:
     return hashlib.sha256(body).hexdigest().encode()
+
+
+def _digests(file: BinaryIO) -> tuple[bytes, bytes]:
+    """The digest at the end of a file, and the one of all before it; a damaged file of any size takes no memory."""
+    left, digest = max(file.seek(0, os.SEEK_END) - _DIGEST_SIZE, 0), hashlib.sha256()
+    file.seek(0)
+    while left and (part := file.read(min(left, 1 << 20))):
+        digest.update(part)
+        left -= len(part)
+    return file.read(_DIGEST_SIZE), digest.hexdigest().encode()
+
+
+def make_directory(directory: Path) -> None:
+    """Makes a directory and those above it, and puts on disk that they are there. Raises `OSError`."""
+    if directory.is_dir():
+        return
+    try:
+        directory.mkdir(exist_ok=True)
+    except FileNotFoundError:
+        make_directory(directory.parent)
+        directory.mkdir(exist_ok=True)
+    with contextlib.suppress(OSError):  # one may make a directory in another that one may not read
+        sync_directory(directory.parent)
 
 
 def sync_directory(directory: Path) -> None:

@@ -5,9 +5,17 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
+import re
+import socket
+import struct
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from metrpo.errors import RunDirectoryError
+from metrpo.untrusted import text_of
 
 Row = dict[str, int | float | None]
 """One iteration by column, in column order; None is an empty cell."""
@@ -26,6 +34,18 @@ def without_clocks(row: Row) -> Row:
 def is_clock(column: str) -> bool:
     """Whether a column holds a clock reading, which no two runs share."""
     return column.startswith("seconds_") or column == "wall_seconds"
+
+
+LATER = ("members_reset",)
+"""Columns that runs begun with an earlier version do not have."""
+
+
+def completed(row: Row, like: Row) -> Row:
+    """A row from before some of the `LATER` columns, with those that `like` has left empty."""
+    late = [name for name in LATER if name in like and name not in row]
+    if not late or [name for name in like if name not in late] != list(row):
+        return row
+    return {name: row.get(name) for name in like}
 
 
 def to_csv(rows: Sequence[Row]) -> str:
@@ -47,9 +67,35 @@ def to_csv(rows: Sequence[Row]) -> str:
 
 
 def read_metrics(path: str | Path) -> list[Row]:
-    """The rows of a `metrics.csv`, ints as ints, floats exactly as written."""
-    with open(path, newline="") as file:
-        return [{name: _parse(cell) for name, cell in row.items()} for row in csv.DictReader(file)]
+    """The rows of a `metrics.csv`, ints as ints, floats exactly as written.
+
+    Raises `RunDirectoryError` when it cannot be read, or is no table of numbers.
+    """
+    text = text_of(Path(path), RunDirectoryError)
+    try:
+        columns, *lines = list(csv.reader(io.StringIO(text, newline=""), strict=True)) or [[]]
+        if len(set(columns)) != len(columns):
+            raise ValueError("a column is there twice")
+        return [dict(zip(columns, map(_parse, line), strict=True)) for line in lines]
+    except (ValueError, csv.Error) as error:
+        raise RunDirectoryError(f"{path}: expected a table of numbers, got something else ({error})") from None
+
+
+def checked(rows: Any, iteration: int) -> list[Row]:
+    """`rows`, which a file says are those of a run after `iteration` iterations.
+
+    Raises `ValueError` when they are not rows of numbers with the same columns, one for each iteration.
+    """
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise ValueError("expected a list of rows")
+    if not all(value is None or type(value) in (int, float) for row in rows for value in row.values()):
+        raise ValueError("expected numbers in every row")
+    to_csv(rows)
+    if rows and not {"iteration", "real_steps", "wall_seconds"} <= rows[0].keys():
+        raise ValueError("expected the columns iteration, real_steps and wall_seconds")
+    if [row["iteration"] for row in rows] != list(range(1, iteration + 1)):
+        raise ValueError(f"expected a row for each of {iteration} iterations, got {len(rows)}")
+    return rows
 
 
 class Events:
@@ -59,24 +105,37 @@ class Events:
     """
 
     def __init__(self, directory: Path, rows: Sequence[Row] = ()) -> None:
-        from tensorboardX import SummaryWriter  # slow to import, and needed by training only
-
+        directory.mkdir(parents=True, exist_ok=True)
         for old in directory.glob("events.out.tfevents.*"):
             old.unlink()
-        self._writer = SummaryWriter(str(directory))
-        for row in rows:
-            self.add(row)
+        self.path = directory / f"events.out.tfevents.{int(time.time())}.{socket.gethostname()}"
+        self._write([{"file_version": "brain.Event:2"}, *(event for row in rows for event in _events(row))])
 
     def add(self, row: Row) -> None:
-        """Writes one row, and puts it on disk."""
-        for name, value in row.items():
-            if value is not None and math.isfinite(value):
-                self._writer.add_scalar(name, value, global_step=int(row["real_steps"] or 0))
-        self._writer.flush()
+        """Writes one row, and puts it on disk. Raises `OSError`."""
+        self._write(_events(row))
 
-    def close(self) -> None:
-        """Ends the events file."""
-        self._writer.close()
+    def _write(self, events: Sequence[Mapping[str, Any]]) -> None:
+        # tensorboardX's own writer has a thread and a queue: a full disk ends the one, then the other waits forever.
+        from tensorboardX.proto.event_pb2 import Event  # slow to import, and needed by training only
+
+        with open(self.path, "ab") as file:
+            file.write(b"".join(_record(Event(wall_time=time.time(), **event).SerializeToString()) for event in events))
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def _events(row: Row) -> list[dict[str, Any]]:
+    step, finite = int(row["real_steps"] or 0), {n: v for n, v in row.items() if v is not None and math.isfinite(v)}
+    return [{"step": step, "summary": {"value": [{"tag": n, "simple_value": v}]}} for n, v in finite.items()]
+
+
+def _record(data: bytes) -> bytes:
+    """As TensorBoard reads it: the length, its checksum, the data, their checksum."""
+    from tensorboardX.record_writer import masked_crc32c
+
+    length = struct.pack("<Q", len(data))
+    return length + struct.pack("<I", masked_crc32c(length)) + data + struct.pack("<I", masked_crc32c(data))
 
 
 def _plain(value: Any) -> int | float | None:
@@ -89,7 +148,5 @@ def _plain(value: Any) -> int | float | None:
 def _parse(cell: str) -> int | float | None:
     if not cell:
         return None
-    try:
-        return int(cell)
-    except ValueError:
-        return float(cell)
+    # A whole number too long for Python is none, and not infinite.
+    return int(cell) if re.fullmatch(r"-?[0-9]+", cell) else float(cell)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -12,6 +14,7 @@ import numpy as np
 
 from metrpo.errors import RunDirectoryError
 from metrpo.run.files import FORMAT, atomic_write, metrpo_version, read_arrays, write_arrays
+from metrpo.untrusted import brief
 
 FILE = "policy.npz"
 
@@ -93,7 +96,8 @@ def save_policy(
 def load_policy(directory: str | Path) -> LoadedPolicy:
     """The policy of a run directory (or of a `policy.npz` itself); needs NumPy only.
 
-    Raises `RunDirectoryError` when there is none, or it is damaged or of another version.
+    Raises `RunDirectoryError` when there is none, or it is damaged, of another version or cannot act: other arrays than
+    its sizes say, or weights that are not finite.
     """
     path = Path(directory)
     path = path if path.suffix == ".npz" else path / FILE
@@ -102,9 +106,54 @@ def load_policy(directory: str | Path) -> LoadedPolicy:
             f"{directory} holds no policy: expected {path}; train one with: metrpo train TASK --run-dir {directory}"
         )
     arrays, meta = read_arrays(path)
-    stored = meta.get("policy", {})
-    missing = [f.name for f in fields(PolicyInfo) if f.name not in stored]
+    info = _info(meta.get("policy", {}), path)
+    return LoadedPolicy(info, _layers(info, arrays, path))
+
+
+def _info(stored: Any, path: Path) -> PolicyInfo:
+    names = [f.name for f in fields(PolicyInfo)]
+    missing = [name for name in names if not (isinstance(stored, dict) and name in stored)]
     if missing:
         raise RunDirectoryError(f"{path} is no policy: it lacks {', '.join(missing)}")
-    info = PolicyInfo(**{**stored, "hidden": tuple(stored["hidden"])})
-    return LoadedPolicy(info, tuple((arrays[f"w{i}"], arrays[f"b{i}"]) for i in range(len(info.hidden) + 1)))
+    if unknown := [name for name in stored if name not in names]:
+        raise RunDirectoryError(f"{path}: expected what this version knows of a policy, got {brief(unknown)}")
+    sizes = stored["hidden"]
+    for name, sound, expected in (
+        ("task", isinstance(stored["task"], str), "a name"),
+        ("observation_size", _is_size(stored["observation_size"]), "a whole number above 0"),
+        ("action_size", _is_size(stored["action_size"]), "a whole number above 0"),
+        ("hidden", isinstance(sizes, list) and all(map(_is_size, sizes)), "a list of whole numbers above 0"),
+        ("activation", stored["activation"] == "tanh", "'tanh'"),
+        # These say where it comes from and mean nothing to its use.
+        *(
+            (n, isinstance(stored[n], int | float | str | None), "a number")
+            for n in ("iteration", "real_steps", "return_real")
+        ),
+    ):
+        if not sound:
+            raise RunDirectoryError(f"{path}: {name}: expected {expected}, got {brief(stored[name])}")
+    return PolicyInfo(**{**stored, "hidden": tuple(sizes)})
+
+
+def _is_size(value: Any) -> bool:
+    return type(value) is int and 0 < value < 2**31
+
+
+def _layers(
+    info: PolicyInfo, arrays: Mapping[str, np.ndarray], path: Path
+) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    sizes = (info.observation_size, *info.hidden, info.action_size)
+    expected: dict[str, tuple[int, ...]] = {"log_std": (info.action_size,)}
+    for i, (inputs, outputs) in enumerate(pairwise(sizes)):
+        expected |= {f"w{i}": (inputs, outputs), f"b{i}": (outputs,)}
+    found = {name: array.shape for name, array in arrays.items()}
+    if found != expected:
+        raise RunDirectoryError(f"{path}: expected weights and biases of shapes {brief(expected)}, got {brief(found)}")
+    for name, array in arrays.items():
+        if array.dtype != np.float32:
+            raise RunDirectoryError(f"{path}: {name}: expected float32, got {array.dtype}")
+        if not np.isfinite(array).all():
+            raise RunDirectoryError(
+                f"{path}: expected finite weights, got infinite or NaN in {name}; take an earlier one"
+            )
+    return tuple((arrays[f"w{i}"], arrays[f"b{i}"]) for i in range(len(sizes) - 1))

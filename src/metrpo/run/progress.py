@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import math
+import os
 import sys
 import time
-from collections.abc import Mapping
-from typing import Any, TextIO
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, TextIO
 
-from rich import progress as rich_progress
-from rich.console import Console
+if TYPE_CHECKING:
+    from rich import progress as rich_progress
+    from rich.console import Console
 
+_log = logging.getLogger("metrpo")
 Row = Mapping[str, Any]
 
 
@@ -63,6 +68,9 @@ class LiveProgress(Progress):
     """The stage with its bar, last returns and time left, drawn in place; finished iterations stay above as lines."""
 
     def __init__(self, console: Console | None = None) -> None:
+        from rich import progress as rich_progress  # slow to import, and needed on terminals only
+        from rich.console import Console
+
         self._bars = rich_progress.Progress(
             rich_progress.SpinnerColumn(),
             rich_progress.TextColumn("[bold]{task.fields[heading]}"),
@@ -109,9 +117,65 @@ class LiveProgress(Progress):
         self._task = None
 
 
+class Guarded(Progress):
+    """Another progress, of which nothing is shown any more once it fails: a closed pipe must not cost hours."""
+
+    def __init__(self, shown: Progress) -> None:
+        self._shown = shown
+
+    def begin(self, iteration: int, of: int | None) -> None:
+        """Passed on."""
+        self._pass_on(lambda shown: shown.begin(iteration, of))
+
+    def stage(self, name: str, total: int | None = None) -> None:
+        """Passed on."""
+        self._pass_on(lambda shown: shown.stage(name, total))
+
+    def update(self, done: int, note: str = "") -> None:
+        """Passed on."""
+        self._pass_on(lambda shown: shown.update(done, note))
+
+    def end(self, row: Row, seconds_left: float | None = None) -> None:
+        """Passed on."""
+        self._pass_on(lambda shown: shown.end(row, seconds_left))
+
+    def close(self) -> None:
+        """Passed on."""
+        self._pass_on(lambda shown: shown.close())
+
+    def _pass_on(self, tell: Callable[[Progress], None]) -> None:
+        shown = self._shown
+        try:
+            tell(shown)
+        except Exception as error:
+            self._shown = SILENT
+            with contextlib.suppress(Exception):
+                shown.close()
+            _log.warning("no progress from here on (%s: %s); training goes on", type(error).__name__, error)
+            if isinstance(error, OSError):
+                _mute(sys.stdout)  # the reader is gone, or the disk full: what follows would fail as well
+            mute_broken_output()
+
+
+def mute_broken_output() -> None:
+    """Lets what is printed from here on vanish, where stdout or stderr cannot be written: `metrpo train ... | head`."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):
+            _mute(stream)
+
+
+def _mute(stream: TextIO) -> None:
+    with contextlib.suppress(OSError, ValueError):  # it is no file, or closed
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
+
+
 def default_progress() -> Progress:
     """A live display on a terminal, plain lines elsewhere."""
-    return LiveProgress() if sys.stdout.isatty() else PlainProgress()
+    return LiveProgress() if sys.stdout is not None and sys.stdout.isatty() else PlainProgress()
 
 
 def summary(row: Row) -> str:
