@@ -215,7 +215,7 @@ def test_the_previous_policy_is_that_before_the_last_phase_that_changed_it(tiny,
 
     def phase(*args):
         values = np.zeros(2, np.float32)
-        return policy, np.zeros(8, np.float32), algorithm.PhaseInfo(values, 10, accepted, 0, 2, 0.0, 0.0, 0.0)
+        return policy, np.zeros(8, np.float32), algorithm.PhaseInfo(values, 10, accepted, 0, 2, np.zeros(2), 0.0, 0.0)
 
     monkeypatch.setattr(algorithm, "_improve", phase)
     old = tiny.states[2]._replace(previous_policy=random_policy(8, 2, 2, hidden=(4,)))
@@ -407,7 +407,8 @@ def test_seventy_percent_of_the_models_decide(tiny, monkeypatch, improved, accep
     script = Script(monkeypatch, tiny, values)
     assert script.info.accepted_updates == accepted
     count = script.info.validations
-    assert script.info.fraction_improved == pytest.approx(improved / 1000 / count)
+    assert script.info.improved.shape == (1000,)
+    assert np.mean(script.info.improved) == pytest.approx(improved / 1000 / count)
 
 
 def test_a_diverged_model_votes_against_and_all_diverged_end_the_phase(tiny, monkeypatch):

@@ -82,7 +82,7 @@ def test_predictions_never_run_over_the_end_of_an_episode(data):
 def test_an_error_over_more_steps_than_any_episode_has_is_unknown(data):
     found = of([(A, B)], data, horizon=100)
     assert np.isnan(found.errors[100]).all()
-    row = found.row(last=100)
+    row = found.row()
     assert np.isnan(row["error_T"])
     assert row["error_25"] < 1e-4
     assert list(row)[:5] == ["error_1", "error_5", "error_10", "error_25", "error_T"]

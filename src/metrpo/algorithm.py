@@ -31,6 +31,7 @@ from metrpo.errors import ConfigError, DivergedError
 from metrpo.finite import naming, require_finite
 from metrpo.model import ensemble as ensembles
 from metrpo.model.calibration import end_calibration
+from metrpo.model.diagnostics import diagnose
 from metrpo.model.ensemble import Ensemble, Networks
 from metrpo.model.fit import FitInfo, fit, refit
 from metrpo.phase import PhaseInfo
@@ -165,6 +166,9 @@ def learn(
         advice = "the run was resumed from, or became, a state that cannot go on: use smaller steps or start anew"
         require_finite("improve", iteration, advice, policy=policy, baseline=baseline)
     with clock("evaluate"), naming("evaluate", iteration):
+        horizon = phase.imagined_horizon(config, task)
+        key = key_of(config.seed, iteration, Stage.DIAGNOSE)
+        diagnosis = diagnose(ensemble, policy, dataset.validation, dataset.train, horizon, key)
         progress.stage("evaluate", config.evaluation_episodes)
         returns = evaluate(config, task, policy, iteration)
     state = State(
@@ -178,6 +182,7 @@ def learn(
     )
     collected = float(np.mean([e.rewards.sum() for e in episodes])) if episodes else math.nan
     row = _row(config, state, returns, collected, fitted, improved)
+    row |= diagnosis.row() | {f"improved_{k}": float(share) for k, share in enumerate(improved.improved)}
     if "end" in task.learned:
         trust = end_calibration(ensemble, dataset.validation)
         row |= {f"end_{name}": value for name, value in trust._asdict().items()}
@@ -322,7 +327,7 @@ def _row(
         "accepted_updates": improved.accepted_updates,
         "rejected_steps": improved.rejected_steps,
         "validations": improved.validations,
-        "fraction_improved": improved.fraction_improved,
+        "fraction_improved": float(np.mean(improved.improved)),
         "kl": improved.kl,
         "mean_std": float(np.mean(np.exp(np.asarray(state.policy.log_std)))),
         "diverged": improved.diverged,

@@ -22,7 +22,7 @@ from metrpo.policy import gaussian
 from metrpo.policy.batch import ImproveInfo
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improve import IMPROVERS, Memory, init_memory
-from metrpo.policy.validate import RULES, Evidence, fraction_improved
+from metrpo.policy.validate import RULES, Evidence, improved
 from metrpo.types import Act, Array, Trajectories
 from metrpo.world.task import Task
 
@@ -41,8 +41,8 @@ class PhaseInfo(NamedTuple):
     rejected_steps: int
     """Updates that moved nothing: rejected by the line search, or with a gradient that was not finite."""
     validations: int
-    fraction_improved: float
-    """Share of the models that value a policy above the accepted one, whatever the rule; mean over the validations."""
+    improved: np.ndarray
+    """[K], share of the validations in which each model values the policy above the accepted one, whatever the rule."""
     kl: float
     """Mean over the updates."""
     diverged: float
@@ -81,7 +81,7 @@ def improve(
     accepted, (values, reference) = policy, judge(policy, np.array([-np.inf]))
     updates = accepted_at = 0
     infos: list[tuple[ImproveInfo, ImagineInfo]] = []
-    fractions: list[float] = []
+    agreed: list[np.ndarray] = []
     while updates - accepted_at < config.validate.patience and updates < config.validate.max_updates:
         block = min(config.validate.every, config.validate.max_updates - updates)
         starts = pool[rng.integers(len(pool), size=(block, rollouts(config, task)))]
@@ -93,7 +93,7 @@ def improve(
         with clock("validate"):
             new_values, evidence = judge(policy, _last_return(infos[-1][1]))
         verdict = rule.decide(evidence, reference, config.validate)
-        fractions.append(fraction_improved(new_values, values))
+        agreed.append(improved(new_values, values))
         if verdict:
             accepted, values, reference, accepted_at = policy, new_values, evidence, updates
         on_validation(updates, accepted_at, float(np.mean(values)))
@@ -106,8 +106,8 @@ def improve(
             updates=updates,
             accepted_updates=accepted_at,
             rejected_steps=int(np.sum(~improve_info.accepted)),
-            validations=len(fractions),
-            fraction_improved=float(np.mean(fractions)),
+            validations=len(agreed),
+            improved=np.mean(agreed, axis=0),
             kl=float(np.mean(improve_info.kl)),
             diverged=float(np.mean(imagine_info.diverged)),
         ),

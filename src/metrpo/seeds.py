@@ -13,7 +13,7 @@ from metrpo.types import Array
 class Stage(IntEnum):
     """What the randomness is for."""
 
-    INIT, COLLECT, FIT, IMPROVE, EVALUATE, SPLIT, RESET = range(7)
+    INIT, COLLECT, FIT, IMPROVE, EVALUATE, SPLIT, RESET, DIAGNOSE = range(8)
 
 
 def key_of(seed: int, iteration: int, stage: Stage) -> Array:

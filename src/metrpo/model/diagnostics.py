@@ -20,7 +20,7 @@ from metrpo.policy.gaussian import Policy
 from metrpo.types import Array, Transitions
 
 HORIZONS = (1, 5, 10, 25)
-"""Steps after which predictions are compared with what happened; the task's horizon comes as the last."""
+"""Steps after which predictions are compared with what happened; an imagined episode's end comes as the last."""
 _STARTS = 100
 _LONGEST = 200
 """Imagined and predicted steps at most, for tasks of a thousand: an error long before that is error enough."""
@@ -39,12 +39,12 @@ class Diagnosis(NamedTuple):
     outside: float
     """Share of these imagined states that leave the range of the training data in any dimension."""
 
-    def row(self, last: int) -> dict[str, float]:
+    def row(self) -> dict[str, float]:
         """As columns: `error_K` (median over the dimensions), `error_K_D` for each dimension, and the rest.
 
-        The horizon of the task, `last`, is called T, whatever its number, so that tasks share their columns.
+        The last K, an imagined episode's end, is called T, whatever its number, so that tasks share their columns.
         """
-        names = {k: "T" if k == last else str(k) for k in self.errors}
+        names = {k: "T" if k == max(self.errors) else str(k) for k in self.errors}
         overall = {f"error_{names[k]}": _median(e) for k, e in self.errors.items()}
         each = {f"error_{names[k]}_{d}": float(x) for k, e in self.errors.items() for d, x in enumerate(e)}
         rest = {name: float(getattr(self, name)) for name in self._fields[1:]}
@@ -64,7 +64,9 @@ def diagnose(
     rows, steps = _starts(held_out, length)
     actions = np.asarray(held_out.actions)[np.minimum(rows[:, None] + np.arange(length), len(held_out.actions) - 1)]
     starts = np.asarray(held_out.states)[rows]
-    predicted, spread, imagined, guessed = jax.device_get(_rollouts(ensemble, policy, starts, actions, key))
+    # From the host: where arrays lie is no reason to compile anew.
+    on_host = jax.device_get((ensemble, policy))
+    predicted, spread, imagined, guessed = jax.device_get(_rollouts(*on_host, starts, actions, key))
     after = np.asarray(held_out.states) + np.asarray(held_out.deltas)[:, :size]
     errors = {}
     for k in [k for k in HORIZONS if k < length] + [length]:

@@ -35,13 +35,19 @@ class Rule(NamedTuple):
     """(of the policy, of the accepted one, config) -> whether the policy becomes the accepted one."""
 
 
-def fraction_improved(values: Array, reference: Array) -> float:
-    """Share of the models whose value [K] exceeds the reference's [K] (paper, eq. 5); ties and NaN are no improvement.
+def improved(values: Array, reference: Array) -> np.ndarray:
+    """[K] of bool: which models' value [K] exceeds the reference's [K]; ties and NaN are no improvement.
 
     A model whose reference is NaN (its rollouts diverged) counts as improved when its value is finite again.
     """
     new, old = np.asarray(values), np.asarray(reference)
-    return float(np.mean(np.isfinite(new) & ((new > old) | np.isnan(old))))
+    found: np.ndarray = np.isfinite(new) & ((new > old) | np.isnan(old))
+    return found
+
+
+def fraction_improved(values: Array, reference: Array) -> float:
+    """Share of the models whose value [K] exceeds the reference's [K] (paper, eq. 5)."""
+    return float(np.mean(improved(values, reference)))
 
 
 def most_improve(values: Array, reference: Array, config: ValidateConfig) -> bool:

@@ -1,9 +1,10 @@
 """A run directory: one run's settings, checkpoints, metrics, policy and curve, written by one process at a time.
 
-    DIR/run.json       format and versions         DIR/metrics.csv   one row per outer iteration
-    DIR/config.json    every setting               DIR/curve.png     the learning curve
-    DIR/checkpoints/   the newest two states       DIR/policy.npz    the policy (policy.json says what it is)
-    DIR/events/        TensorBoard                 DIR/video.mp4     the final policy at work
+    DIR/run.json       format and versions         DIR/metrics.csv      one row per outer iteration
+    DIR/config.json    every setting               DIR/diagnostics.csv  the same for each model and state dimension
+    DIR/checkpoints/   the newest two states       DIR/policy.npz       the policy (policy.json says what it is)
+    DIR/events/        TensorBoard                 DIR/curve.png        the learning curve
+    DIR/video.mp4      the final policy at work
     DIR/episodes/      real episodes that the state has not learned from (see `metrpo.run.episodes`)
 
 The newest checkpoint is the run: it holds the state and all rows. Everything else is derived from it, written after it
@@ -32,7 +33,18 @@ from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.claim import claim, require_same
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.files import DamagedFile, atomic_write, writing
-from metrpo.run.metrics import Events, Row, checked, completed, plain, read_metrics, to_csv, without_clocks
+from metrpo.run.metrics import (
+    Events,
+    Row,
+    checked,
+    completed,
+    details,
+    overview,
+    plain,
+    read_metrics,
+    to_csv,
+    without_clocks,
+)
 from metrpo.run.policy_file import Weights, save_policy
 from metrpo.run.report import draw_curve
 from metrpo.untrusted import text_of
@@ -210,7 +222,9 @@ class RunDirectory:
         result = self.rows[-1].get("return_real") if self.rows else None
         result = result if result is not None and math.isfinite(result) else None
         if self.rows:
-            atomic_write(self.path / "metrics.csv", to_csv(self.rows))
+            atomic_write(self.path / "metrics.csv", to_csv([overview(row) for row in self.rows]))
+            if all(rows := [details(row) for row in self.rows]):
+                atomic_write(self.path / "diagnostics.csv", to_csv(rows))
         save_policy(self.path, state.policy, self.config.task, state.iteration, state.real_steps, result)
         if not self.rows:
             return

@@ -36,13 +36,26 @@ def is_clock(column: str) -> bool:
     return column.startswith("seconds_") or column == "wall_seconds"
 
 
-LATER = ("members_reset",)
+_LATER = re.compile(r"members_reset|(error|disagreement|improved)_\w+|outside")
 """Columns that runs begun with an earlier version do not have."""
+_DETAIL = re.compile(r"error_\w+_\d+|improved_\d+")
+"""Columns of one state dimension or one model."""
+
+
+def overview(row: Row) -> Row:
+    """The row's columns for metrics.csv: one for each thing measured."""
+    return {name: value for name, value in row.items() if not _DETAIL.fullmatch(name)}
+
+
+def details(row: Row) -> Row:
+    """The row's columns for diagnostics.csv: one for each state dimension or model; empty when it has none."""
+    found = {name: value for name, value in row.items() if _DETAIL.fullmatch(name)}
+    return {name: row[name] for name in ("iteration", "real_steps")} | found if found else {}
 
 
 def completed(row: Row, like: Row) -> Row:
-    """A row from before some of the `LATER` columns, with those that `like` has left empty."""
-    late = [name for name in LATER if name in like and name not in row]
+    """A row from before some of the columns came up, with those that `like` has left empty."""
+    late = [name for name in like if name not in row and _LATER.fullmatch(name)]
     if not late or [name for name in like if name not in late] != list(row):
         return row
     return {name: row.get(name) for name in like}
@@ -126,7 +139,10 @@ class Events:
 
 
 def _events(row: Row) -> list[dict[str, Any]]:
-    step, finite = int(row["real_steps"] or 0), {n: v for n, v in row.items() if v is not None and math.isfinite(v)}
+    step, finite = (
+        int(row["real_steps"] or 0),
+        {n: v for n, v in overview(row).items() if v is not None and math.isfinite(v)},
+    )
     return [{"step": step, "summary": {"value": [{"tag": n, "simple_value": v}]}} for n, v in finite.items()]
 
 
