@@ -29,7 +29,7 @@ test: $(READY)  ## lint, types, import rules and the fast tests
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
-	$(BIN)/pytest
+	$(BIN)/pytest -n 2 --dist loadfile
 
 test-slow: $(READY)  ## the tests that learn for minutes
 	$(BIN)/pytest -m slow --timeout=1800

@@ -130,7 +130,7 @@ def test_a_broken_environment_ends_with_how_to_go_on(tmp_path, monkeypatch, caps
     command = ["train", "Probe", "--trust-reward", "--collect.steps", "100", "--run-dir", str(tmp_path / "run")]
     assert cli.main(command) == 2
     err = capsys.readouterr().err
-    assert "metrpo: collect, iteration 1: the motor is hot\n" in err
+    assert "metrpo: collect, iteration 1: the motor is hot" in err
     assert "run keeps every finished iteration and real episode. The same command goes on." in err
     assert len(EpisodeLog(tmp_path / "run").pending()) == 2
 

@@ -44,8 +44,8 @@ SETTINGS = {
 }
 CONFIG = override(dataclasses.replace(preset("Swimmer"), task="Probe"), SETTINGS)
 NEWEST, PREVIOUS = "checkpoints/iteration-00003.npz", "checkpoints/iteration-00002.npz"
-FILES = 14
-DERIVED = ("metrics.csv", "policy.npz", "policy.json", "curve.png")
+FILES = 15
+DERIVED = ("metrics.csv", "diagnostics.csv", "policy.npz", "policy.json", "curve.png")
 
 
 class Found(NamedTuple):

@@ -404,7 +404,7 @@ def test_a_member_that_explodes_takes_its_own_rollouts_and_nothing_else(clean, v
     policy, baseline, info = in_imagination(clean, ensemble, {"imagine.sampling": "eps_rand"})
     assert 0 < info.diverged < 1
     assert info.rejected_steps == 0
-    assert sound((policy, baseline, info.kl, info.fraction_improved, info.values[[0, 2]]))
+    assert sound((policy, baseline, info.kl, info.improved, info.values[[0, 2]]))
     assert math.isnan(info.values[1])
     # The others outvote it: of three, two are less than 70 %.
     assert info.fraction_improved <= 2 / 3 + 1e-6
