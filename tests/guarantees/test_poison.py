@@ -407,7 +407,8 @@ def test_a_member_that_explodes_takes_its_own_rollouts_and_nothing_else(clean, v
     assert sound((policy, baseline, info.kl, info.improved, info.values[[0, 2]]))
     assert math.isnan(info.values[1])
     # The others outvote it: of three, two are less than 70 %.
-    assert info.fraction_improved <= 2 / 3 + 1e-6
+    assert info.improved[1] == 0, "a model that explodes vouches for nothing"
+    assert info.improved.mean() <= 2 / 3 + 1e-6
 
 
 @pytest.mark.parametrize("value", [*POISON, 1e20])
