@@ -92,9 +92,9 @@ def main() -> None:
     parser.add_argument("run_dir", type=Path)
     parser.add_argument("--hours", type=float, default=3.0)
     parser.add_argument("--kills", type=int, default=10)
-    mine, _, train = " ".join(sys.argv[1:]).partition(" -- ")  # argparse would take --iterations for its own
-    given = parser.parse_args(mine.split())
-    command = [sys.executable, "-m", "metrpo", "train", *train.split(), "--run-dir", str(given.run_dir)]
+    at = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)  # argparse would take what follows for its own
+    given = parser.parse_args(sys.argv[1:at])
+    command = [sys.executable, "-m", "metrpo", "train", *sys.argv[at + 1 :], "--run-dir", str(given.run_dir)]
     os.environ["MUJOCO_GL"] = "disabled"  # no video at the end
     soak(given.run_dir, given.hours, given.kills, command)
 

@@ -130,6 +130,23 @@ def registered():
         yield
 
 
+BRIEF = {
+    "collect.steps": 60,
+    "collect.max_train": 200,
+    "collect.max_validation": 100,
+    "ensemble.members": 2,
+    "ensemble.hidden": (8,),
+    "fit.max_steps": 20,
+    "imagine.steps": 400,
+    "policy.hidden": (8,),
+    "validate.max_updates": 5,
+    "validate.starts": 5,
+    "evaluation_episodes": 2,
+    "deterministic": True,
+    "trust_reward": True,
+}
+"""Settings with which an iteration takes no time; the run in tests/guarantees/format-1 was made with them."""
+
 LEARN = {
     "collect.max_train": 1000,
     "collect.max_validation": 500,

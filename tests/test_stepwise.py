@@ -27,21 +27,7 @@ from metrpo.world import registry
 from metrpo.world.task import Task
 
 ROBOT = Path(__file__).resolve().parents[1] / "examples" / "robot"
-SMALL = {
-    "collect.steps": 100,
-    "collect.max_train": 400,
-    "collect.max_validation": 200,
-    "ensemble.members": 2,
-    "ensemble.hidden": (8,),
-    "fit.max_steps": 20,
-    "imagine.steps": 400,
-    "policy.hidden": (8,),
-    "validate.max_updates": 5,
-    "validate.starts": 5,
-    "evaluation_episodes": 2,
-    "deterministic": True,
-    "trust_reward": True,
-}
+SMALL = probe.BRIEF | {"collect.steps": 100, "collect.max_train": 400, "collect.max_validation": 200}
 
 
 class Fragile(gymnasium.Wrapper):

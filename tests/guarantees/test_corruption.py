@@ -26,23 +26,7 @@ from metrpo.run import directory as directories
 from metrpo.run.directory import RunDirectory, stored_config
 from metrpo.run.episodes import append_episode
 
-SETTINGS = {
-    "collect.steps": 60,
-    "collect.max_train": 200,
-    "collect.max_validation": 100,
-    "ensemble.members": 2,
-    "ensemble.hidden": (8,),
-    "fit.max_steps": 20,
-    "imagine.steps": 400,
-    "policy.hidden": (8,),
-    "validate.max_updates": 5,
-    "validate.starts": 5,
-    "evaluation_episodes": 2,
-    "deterministic": True,
-    "trust_reward": True,
-    "iterations": 3,
-}
-CONFIG = override(dataclasses.replace(preset("Swimmer"), task="Probe"), SETTINGS)
+CONFIG = override(dataclasses.replace(preset("Swimmer"), task="Probe", iterations=3), probe.BRIEF)
 NEWEST, PREVIOUS = "checkpoints/iteration-00003.npz", "checkpoints/iteration-00002.npz"
 FILES = 15
 DERIVED = ("metrics.csv", "diagnostics.csv", "policy.npz", "policy.json", "curve.png")

@@ -1,6 +1,6 @@
 """A directory of format 1, as the code of commit 44a0ecc wrote it, goes on today; other formats are refused by name.
 
-`format-1` was made by that commit's `train` with the probe and `SETTINGS`, without what is derived (curve, events).
+`format-1` was made by that commit's `train` with `CONFIG`, without what is derived (curve, events).
 """
 
 from __future__ import annotations
@@ -28,23 +28,7 @@ from metrpo.run.policy_file import load_policy
 from metrpo.types import Episode
 
 OLD = Path(__file__).parent / "format-1"
-SETTINGS = {
-    "collect.steps": 60,
-    "collect.max_train": 200,
-    "collect.max_validation": 100,
-    "ensemble.members": 2,
-    "ensemble.hidden": (8,),
-    "fit.max_steps": 20,
-    "imagine.steps": 400,
-    "policy.hidden": (8,),
-    "validate.max_updates": 5,
-    "validate.starts": 5,
-    "evaluation_episodes": 2,
-    "deterministic": True,
-    "trust_reward": True,
-    "iterations": 2,
-}
-CONFIG = override(dataclasses.replace(preset("Swimmer"), task="Probe"), SETTINGS)
+CONFIG = override(dataclasses.replace(preset("Swimmer"), task="Probe", iterations=2), probe.BRIEF)
 
 
 @pytest.fixture(autouse=True)

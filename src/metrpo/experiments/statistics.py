@@ -103,6 +103,13 @@ def at_steps(curves: Sequence[tuple[Array, Array]], grid: Array) -> np.ndarray:
     return np.array([np.interp(grid, *_curve(*curve), left=np.nan, right=np.nan) for curve in curves])
 
 
+def mean_band(curves: Sequence[tuple[Array, Array]], grid: Array) -> tuple[np.ndarray, Array, Array]:
+    """Mean of learning curves (see `at_steps`) [G], and its 95 % bootstrap interval [G], [G] (of two, their range)."""
+    values = at_steps(curves, grid)
+    low, high = stratified_bootstrap(lambda scores: np.mean(scores[0], axis=0), [values], repetitions=500)
+    return values.mean(axis=0), low, high
+
+
 def _by_task(scores: Scores) -> list[np.ndarray]:
     if isinstance(scores, list | tuple):
         tasks = [np.asarray(task, np.float64) for task in scores]

@@ -13,6 +13,7 @@ from metrpo.experiments.reproduce import rows_of
 from metrpo.experiments.statistics import (
     at_steps,
     iqm,
+    mean_band,
     probability_of_improvement,
     steps_to_reach,
     stratified_bootstrap,
@@ -57,9 +58,7 @@ def mean_curve(curves: Curves, column: str, log: bool) -> tuple[np.ndarray, np.n
     seeds = curves.column(column)
     first, last = max(steps[0] for steps, _ in seeds), min(steps[-1] for steps, _ in seeds)
     grid = np.geomspace(first, last, GRID) if log else np.linspace(first, last, GRID)
-    values = at_steps(seeds, grid)
-    low, high = stratified_bootstrap(lambda scores: np.mean(scores[0], axis=0), [values], repetitions=500)
-    return grid, values.mean(axis=0), low, high
+    return grid, *mean_band(seeds, grid)
 
 
 def summarise(figure: str, runs: Sequence[Run], out: Path) -> list[dict[str, Any]]:

@@ -139,10 +139,8 @@ class Events:
 
 
 def _events(row: Row) -> list[dict[str, Any]]:
-    step, finite = (
-        int(row["real_steps"] or 0),
-        {n: v for n, v in overview(row).items() if v is not None and math.isfinite(v)},
-    )
+    step = int(row["real_steps"] or 0)
+    finite = {n: v for n, v in overview(row).items() if v is not None and math.isfinite(v)}
     return [{"step": step, "summary": {"value": [{"tag": n, "simple_value": v}]}} for n, v in finite.items()]
 
 

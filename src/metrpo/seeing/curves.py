@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from metrpo.experiments.statistics import at_steps, stratified_bootstrap
+from metrpo.experiments.statistics import mean_band
 from metrpo.seeing.runs import Group, SeenRun
 
 POINTS = 60
@@ -41,9 +41,7 @@ def curve(group: Group, x: str, y: str) -> Curve:
     if first > last:
         return Curve(seeds, nothing, nothing, nothing, nothing)
     grid = np.linspace(first, last, POINTS) if last > first else np.array([first])
-    values = at_steps(seeds, grid)
-    low, high = stratified_bootstrap(lambda scores: np.mean(scores[0], axis=0), [values], repetitions=500)
-    return Curve(seeds, grid, values.mean(axis=0), low, high)
+    return Curve(seeds, grid, *mean_band(seeds, grid))
 
 
 def x_axis(runs: Sequence[SeenRun]) -> tuple[str, str]:
