@@ -37,6 +37,7 @@ from metrpo.options import (
     Sweep,
     Tasks,
     Train,
+    Tune,
     Watch,
     parse,
 )
@@ -320,6 +321,40 @@ def _sweep(command: Sweep) -> int:
     return 1 if failed else 0
 
 
+def _tune(command: Tune) -> int:
+    from metrpo.experiments.draw_tuned import draw
+    from metrpo.experiments.search import as_typed, from_file
+    from metrpo.experiments.tune import tune
+    from metrpo.experiments.tuned import PICTURE, describe
+    from metrpo.run.files import folder_name
+    from metrpo.run.machine import cores
+
+    def tell(text: str) -> None:
+        print(text, file=sys.stderr if command.json else sys.stdout, flush=True)
+
+    search = as_typed(command) if command.spec is None else from_file(command.spec)
+    out = command.out or Path("runs") / f"tune-{folder_name(search.task)}"
+    tell(describe(search, out))
+    if command.dry_run:
+        return 0
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        found = tune(search, out, command.jobs or max(1, cores() // len(search.seeds)), tell)
+    except (KeyboardInterrupt, Stopped):
+        _say(f"metrpo: stopped; {out} keeps every finished iteration. The same command goes on.")
+        raise
+    picture = out / PICTURE if draw(found, out / PICTURE) else None
+    if command.json:
+        print(json.dumps({**found.record(), "out": str(out), "picture": picture and str(picture)}))
+    else:
+        found.print()
+        print(picture or f"{out}: nothing to draw yet")
+    if found.failed:
+        logs = f"the ends of their logs stand in {out}"
+        print(f"metrpo: {len(found.failed)} of {len(found.records)} trials failed; {logs}", file=sys.stderr)
+    return 1 if found.failed else 0
+
+
 def _report_page(command: Report) -> int:
     from metrpo.run.files import atomic_write
     from metrpo.seeing.page import page, record
@@ -390,6 +425,7 @@ _COMMANDS: dict[type, Callable[[Any], int]] = {
     Bench: _bench,
     Reproduce: _reproduce,
     Sweep: _sweep,
+    Tune: _tune,
     Report: _report_page,
     Plot: _plot,
     Watch: _watch,

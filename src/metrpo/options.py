@@ -284,6 +284,71 @@ class Sweep:
 
 
 @dataclass(frozen=True)
+class Tune:
+    """Search over settings with Optuna: trials are ordinary runs, bad ones stopped early on their real return.
+
+    Give several seeds: what one run earns is noise. The same command goes on. Needs: pip install 'metrpo[tune]'.
+    For example:
+        metrpo tune --task Swimmer --search "trpo.max_kl=log 0.003..0.1" --search "ensemble.members=1,3,5"
+        metrpo tune --search "policy.initial_std=0.5..3" --search "validate.patience=10..50 step 10" --dry-run
+        metrpo tune search.toml --jobs 2 --out runs/tune-Swimmer
+
+    where search.toml holds, say:
+        task = "Swimmer"
+        trials = 30
+        real_steps = 15000
+        search.trpo.max_kl = "log 0.003..0.1"
+        search.ensemble.members = [1, 3, 5]
+    """
+
+    spec: Annotated[Positional[Path | None], arg(metavar="SPEC")] = None
+    """The search as a TOML file: task, trials, seeds, iterations or real_steps, system, preset, pruner, sampler_seed,
+    and tables [search] and [set]; instead of the options of these names."""
+    task: str = "Swimmer"
+    """Task, as metrpo train takes it."""
+    search: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, arg(metavar="NAME=RANGE")] = ()
+    """A setting and its range, A..B, log A..B or A..B step C, or its choices, such as 1,3,5 or [64],[200,200]."""
+    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, arg(metavar="NAME=VALUE")] = ()
+    """Another setting that is not the preset's."""
+    trials: int = 20
+    """Trials in all; may be raised later."""
+    seeds: str = "0:2"
+    """Seeds of every trial, side by side: a number, a range such as 0:3 (0 to 2), or a list such as 0,2,7."""
+    iterations: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
+    """Outer iterations of every run; default: the preset's."""
+    real_steps: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
+    """Instead of --iterations: real steps of every run."""
+    system: System = "me-trpo"
+    """System, as metrpo train takes it."""
+    preset: Preset = "fast"
+    """What all other settings start from."""
+    pruner: Literal["median", "halving", "none"] = "median"
+    """Stop a trial when its best return so far is below the median of the others' after as many iterations, when it is
+    not among the best third (successive halving), or never."""
+    sampler_seed: int = 0
+    """Decides which settings are tried."""
+    jobs: Annotated[int | None, arg(metavar="INT")] = None
+    """Trials at a time, on cores of their own; default: as many as their seeds have a core each."""
+    out: Annotated[Path | None, arg(metavar="DIR")] = None
+    """Folder of the study, its picture and the runs: <task>/trial-<number>/seed-<seed>; default: runs/tune-<task>."""
+    json: bool = False
+    """Print all trials and the best one as JSON."""
+    dry_run: bool = False
+    """Only say what would be searched."""
+
+    def __post_init__(self) -> None:
+        if self.jobs is not None and self.jobs < 1:
+            raise ConfigError(f"jobs: expected at least 1, got {self.jobs}")
+        if self.spec is not None:
+            apart = ("spec", "jobs", "out", "json", "dry_run")
+            given = [f.name for f in dataclasses.fields(self) if getattr(self, f.name) != f.default]
+            if twice := [name for name in given if name not in apart]:
+                raise ConfigError(
+                    f"{twice[0]}: expected it in {self.spec} alone; write it there, or leave the file out"
+                )
+
+
+@dataclass(frozen=True)
 class Report:
     """Write one HTML page about some runs: health warnings in plain words, learning curves, diagnostics, videos.
 
@@ -370,6 +435,7 @@ Command = (
     | Bench
     | Reproduce
     | Sweep
+    | Tune
     | Report
     | Plot
     | Watch
@@ -425,6 +491,7 @@ def _with_defaults(run: Run, arguments: list[str], quiet: bool = False) -> Comma
         | Annotated[Bench, subcommand("bench")]
         | Annotated[Reproduce, subcommand("reproduce")]
         | Annotated[Sweep, subcommand("sweep")]
+        | Annotated[Tune, subcommand("tune")]
         | Annotated[Report, subcommand("report")]
         | Annotated[Plot, subcommand("plot")]
         | Annotated[Watch, subcommand("watch")]

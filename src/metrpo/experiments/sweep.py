@@ -67,7 +67,7 @@ def from_file(path: Path) -> Grid:
     if not isinstance(settings, dict) or not all(isinstance(spec.get(k, []), list | tuple) for k in ("tasks", "seeds")):
         raise ConfigError(f"{path}: expected lists of tasks and seeds, and a table [set]")
     lists = {key: value if key == "preset" else tuple(value) for key, value in spec.items()}
-    columns = {name: value if isinstance(value, list) else [value] for name, value in _flat(settings).items()}
+    columns = {name: value if isinstance(value, list) else [value] for name, value in flat(settings).items()}
     return Grid(**cast(Any, {"tasks": (), **lists, "settings": columns}))
 
 
@@ -105,11 +105,11 @@ def _plain(word: str) -> Any:
         return word
 
 
-def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     """TOML's ensemble.members is a table in a table."""
     found: dict[str, Any] = {}
     for name, value in table.items():
-        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
     return found
 
 

@@ -26,7 +26,7 @@ def claim(path: Path, config: Config) -> TextIO:
     another version or one with other settings; nothing in it has been changed then.
     """
     _create(path)
-    lock = _lock(path)
+    lock = hold(path)
     try:
         _check_or_describe(path / "run.json")
         _check_or_write_config(path / "config.json", config, any(path.glob("checkpoints/*.npz")))
@@ -51,7 +51,8 @@ def _create(path: Path) -> None:
         )
 
 
-def _lock(path: Path) -> TextIO:
+def hold(path: Path) -> TextIO:
+    """Locks a directory for this process, until the file is closed. Raises `RunDirectoryError` when another has it."""
     # The kernel drops the lock when the process ends, however it ends: no stale locks to clean up.
     try:
         file = open(path / ".lock", "a+", errors="replace")  # noqa: SIM115 - it stays open as long as the run

@@ -1,0 +1,272 @@
+"""Searches over settings: trials as ordinary runs, several at a time, stopped early where their real return is bad."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from metrpo.errors import MetrpoError
+from metrpo.experiments.figures import Run
+from metrpo.experiments.reproduce import _shares_of_cores, _start, rows_of
+from metrpo.experiments.search import Search, worth
+from metrpo.experiments.study import ask, opened_study, taken_up
+from metrpo.experiments.tuned import Tuned, shown, tuned
+from metrpo.run.progress import duration
+from metrpo.seeing.watch import is_running
+
+if TYPE_CHECKING:
+    from optuna import Study, Trial
+
+Tell = Callable[[str], None]
+Cores = tuple[int, ...]
+_POLL = 0.5
+"""Seconds between two looks at the runs."""
+_TAIL = 5
+"""Lines of a failed run's log that are kept."""
+_HOPELESS = 3
+"""Failures in a session before anything goes well, after which no further trial is begun."""
+
+
+class Worker(Protocol):
+    """A run that goes on in another process; `subprocess.Popen` is one."""
+
+    def poll(self) -> int | None:
+        """Its exit code once it has ended."""
+
+    def terminate(self) -> None:
+        """Asks it to stop after its iteration; once more: at once."""
+
+    def wait(self) -> int:
+        """Waits for its end and returns its exit code."""
+
+
+Begin = Callable[[Run, Path, Cores], Worker]
+
+
+@dataclass
+class _Going:
+    """A trial that is under way."""
+
+    trial: Trial
+    values: dict[str, Any]
+    runs: list[Run]
+    workers: dict[Run, Worker]
+    cores: list[Cores]
+    reported: int
+    """Iterations that the pruner has seen."""
+    pruned: int | None
+    """The iteration after which it was found bad."""
+    began: float = field(default_factory=time.monotonic)
+
+    def stop(self) -> None:
+        for worker in self.workers.values():
+            if worker.poll() is None:
+                worker.terminate()
+
+
+def begin(run: Run, out: Path, cores: Cores) -> Worker:
+    """The run as a `metrpo train` of its own on these cores, or the one that is still at it."""
+    return _Orphan(run, out, cores) if is_running(out / run.name) else _start(run, out, cores).process
+
+
+def tune(search: Search, out: Path, jobs: int, tell: Tell, begin: Begin = begin) -> Tuned:
+    """Makes trials, `jobs` at a time and each on cores of its own, until there are as many as asked for.
+
+    Returns what all trials under `out` have given. Started anew it goes on: finished trials are kept, those under way
+    are resumed. Ctrl-C or SIGTERM stops the runs too, each with its iteration saved; once more stops them at once.
+
+    Raises `MetrpoError` when `out` cannot be used (see `opened_study`), or when the first trials all fail.
+    """
+    with opened_study(search, out) as study:
+        _Tuning(search, study, out, jobs, tell, begin).run()
+        return tuned(study, search)
+
+
+class _Tuning:
+    """One session: what is under way, and what becomes of it."""
+
+    def __init__(self, search: Search, study: Study, out: Path, jobs: int, tell: Tell, begin: Begin) -> None:
+        self._search, self._study, self._out, self._tell, self._begin = search, study, out, tell, begin
+        seeds, shares = len(search.seeds), _shares_of_cores(jobs * len(search.seeds))
+        self._free = [shares[i * seeds : (i + 1) * seeds] for i in range(jobs)]
+        self._going: list[_Going] = []
+        self._failed, self._hopeful = 0, any(t.state.name == "COMPLETE" for t in study.get_trials(deepcopy=False))
+
+    def run(self) -> None:
+        of = [trial.state.name for trial in self._study.get_trials(deepcopy=False)]
+        broken_off = [number for number, state in enumerate(of) if state == "RUNNING"]
+        done = len(of) - len(broken_off) - of.count("WAITING")
+        self._tell(f"{done} of {self._search.trials} trials are finished, {len(broken_off)} broken off")
+        try:
+            while True:
+                while self._free and (broken_off or self._wants_more()):
+                    self._start(broken_off.pop(0) if broken_off else None)
+                if not self._going:
+                    break
+                time.sleep(_POLL)
+                for going in list(self._going):
+                    self._look_at(going)
+        finally:
+            self._stop_all()
+        if self._is_hopeless():
+            raise MetrpoError(
+                f"{self._failed} trials have failed and none went well: mend what the end of their logs says, then "
+                "give the same command again"
+            )
+
+    def _wants_more(self) -> bool:
+        made = sum(t.state.name != "WAITING" for t in self._study.get_trials(deepcopy=False))
+        return made < self._search.trials and not self._is_hopeless()
+
+    def _is_hopeless(self) -> bool:
+        return self._failed >= _HOPELESS and not self._hopeful
+
+    def _start(self, number: int | None) -> None:
+        study, search = self._study, self._search
+        trial, values = ask(study, search) if number is None else taken_up(study, search, number)
+        frozen = study.get_trials(deepcopy=False)[trial.number]
+        runs = search.runs(trial.number, values)
+        self._tell(f"trial {trial.number}: {shown(values)}" + ("" if number is None else ", resumed"))
+        going = _Going(
+            trial=trial,
+            values=values,
+            runs=runs,
+            workers={},
+            cores=self._free.pop(0),
+            reported=max(frozen.intermediate_values, default=0),
+            pruned=frozen.user_attrs.get("pruned_after"),
+        )
+        self._going.append(going)
+        for run, cores in zip(runs, going.cores, strict=True):
+            if not search.is_spent(rows_of(run, self._out)) and going.pruned is None:
+                going.workers[run] = self._begin(run, self._out, cores)
+            elif is_running(self._out / run.name):
+                going.workers[run] = _Orphan(run, self._out, cores)
+        if going.pruned is not None:
+            going.stop()
+
+    def _look_at(self, going: _Going) -> None:
+        codes = [
+            worker.poll() for worker in going.workers.values()
+        ]  # before the rows: what has ended has written all of them
+        rows = [rows_of(run, self._out) for run in going.runs]
+        whole = all(map(self._search.is_spent, rows))
+        if going.pruned is None:
+            self._report(going, rows, whole)
+        if None in codes:
+            if going.pruned is None and any(codes):  # one seed has failed, which the others cannot mend
+                going.pruned = 0
+                going.stop()
+            return
+        self._going.remove(going)
+        self._free.append(going.cores)
+        self._finish(going, rows, whole)
+
+    def _report(self, going: _Going, rows: Sequence[Sequence[Any]], whole: bool) -> None:
+        """Tells the pruner of the iterations that all seeds have finished, and stops the trial if they are bad."""
+        measured = min(map(len, rows))
+        for iteration in range(going.reported + 1, measured + 1):
+            each = worth(rows, iteration)
+            going.reported = iteration
+            value = math.fsum(each) / len(each)
+            going.trial.report(value, iteration)
+            self._tell(f"trial {going.trial.number}: iteration {iteration}/{self._search.steps}, return {value:.1f}")
+            if not (whole and iteration == measured) and going.trial.should_prune():
+                going.pruned = iteration
+                going.trial.set_user_attr("pruned_after", iteration)  # stays so when this process is killed meanwhile
+                going.stop()
+                return
+
+    def _finish(self, going: _Going, rows: Sequence[Sequence[Any]], whole: bool) -> None:
+        trial, took = going.trial, duration(time.monotonic() - going.began)
+        trial.set_user_attr("real_steps", sum(int(r[-1]["real_steps"] or 0) for r in rows if r))
+        each = worth(rows) if all(rows) else []
+        value = math.fsum(each) / len(each) if each else math.nan
+        if whole and math.isfinite(value):
+            trial.set_user_attr("returns", each)
+            self._study.tell(trial, value)
+            self._hopeful = True
+            self._tell(f"trial {trial.number}: return {value:.1f}, in {took}")
+        elif going.pruned:
+            self._study.tell(trial, state=_state("PRUNED"))
+            self._hopeful = True
+            self._tell(f"trial {trial.number}: pruned after {going.pruned} iterations, in {took}")
+        else:
+            why = f"the return is {value}" if whole else self._why(going)
+            trial.set_user_attr("failure", why)
+            self._study.tell(trial, state=_state("FAIL"))
+            self._failed += 1
+            self._tell(f"trial {trial.number}: FAILED after {took}: {why}")
+
+    def _why(self, going: _Going) -> str:
+        """The last words of the run that failed, rather than of one that was stopped for that."""
+        codes = {run: worker.poll() for run, worker in going.workers.items()}
+        short = [run for run in codes if not self._search.is_spent(rows_of(run, self._out))] or list(codes)
+        run = next((run for run in short if codes[run] != 128 + signal.SIGTERM), short[0])
+        log = self._out / f"{run.name}.log"
+        lines = log.read_text(errors="replace").splitlines()[-_TAIL:] if log.exists() else []
+        return "\n      ".join([f"exit code {codes[run]}; the end of {log}:", *lines])
+
+    def _stop_all(self) -> None:
+        """Ends what is under way: each run finishes its iteration, and when this is interrupted is asked once more."""
+        if self._going:
+            self._tell(f"stopping {len(self._going)} trials after their iteration; once more stops them at once")
+        try:
+            self._end_all()
+        except BaseException:
+            self._end_all()
+            raise
+
+    def _end_all(self) -> None:
+        for going in self._going:
+            going.stop()
+        for going in self._going:
+            for worker in going.workers.values():
+                worker.wait()
+
+
+class _Orphan:
+    """A run whose `metrpo tune` was killed, while it went on by itself: watched, and taken over once it ends."""
+
+    def __init__(self, run: Run, out: Path, cores: Cores) -> None:
+        self._run, self._out, self._cores = run, out, cores
+        self._asked = False
+        self._process: Worker | None = None
+
+    def poll(self) -> int | None:
+        """Its exit code, 0 for one that ended by itself: what it was before nobody knows."""
+        if self._process is None:
+            if is_running(self._out / self._run.name):
+                return None
+            if self._asked:
+                return 0
+            self._process = _start(self._run, self._out, self._cores).process
+        return self._process.poll()
+
+    def terminate(self) -> None:
+        """Asks whoever holds the run's lock."""
+        self._asked = True
+        if self._process is not None:
+            self._process.terminate()
+        elif is_running(self._out / self._run.name):
+            with suppress(OSError, ValueError):
+                os.kill(int((self._out / self._run.name / ".lock").read_text()), signal.SIGTERM)
+
+    def wait(self) -> int:
+        """Waits for its end."""
+        while (code := self.poll()) is None:
+            time.sleep(_POLL)
+        return code
+
+
+def _state(name: str) -> Any:
+    from optuna.trial import TrialState
+
+    return TrialState[name]
