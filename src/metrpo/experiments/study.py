@@ -71,29 +71,36 @@ def opened_study(search: Search, out: Path) -> Iterator[Study]:
         study = _load(out / FILE, search)
         _require_same(study.user_attrs.get(_SPEC), search, out)
         if not study.get_trials(deepcopy=False) and search.usual is not None:
-            labels = {name: search.space[name].label(value) for name, value in search.usual.items()}
-            study.enqueue_trial(labels)  # what all others are held against
+            _enqueue(study, search, search.usual)  # what all others are held against
         yield study
 
 
 def ask(study: Study, search: Search) -> tuple[Trial, dict[str, Any]]:
     """A new trial, and its settings."""
-    number = len(study.get_trials(deepcopy=False))
-    waiting = [t.number for t in study.get_trials(deepcopy=False) if t.state.name == "WAITING"]
-    study.sampler = _sampler(search, waiting[0] if waiting else number)
+    import optuna
+
+    trials = study.get_trials()
+    if not any(trial.state.name == "WAITING" for trial in trials):
+        # All settings are drawn before the first is written, and then written in one line.
+        drawn = optuna.create_study(direction="maximize", sampler=_sampler(search, len(trials)))
+        drawn.add_trials(trials)
+        _enqueue(study, search, _values(drawn.ask(), search))
     trial = study.ask()
     return trial, _values(trial, search)
 
 
 def taken_up(study: Study, search: Search, number: int) -> tuple[Trial, dict[str, Any]]:
-    """A trial that was under way when the last process ended, and its settings; those not drawn yet are drawn now."""
+    """A trial that was under way when the last process ended, and its settings."""
     from optuna import Trial
 
     storage = study._storage
-    study.sampler = _sampler(search, number)
     key = storage.get_study_id_from_name(_NAME)
     trial = Trial(study, storage.get_trial_id_from_study_id_trial_number(key, number))
     return trial, _values(trial, search)
+
+
+def _enqueue(study: Study, search: Search, values: Mapping[str, Any]) -> None:
+    study.enqueue_trial({name: search.space[name].label(value) for name, value in values.items()})
 
 
 def _values(trial: Trial, search: Search) -> dict[str, Any]:
@@ -125,9 +132,9 @@ def _load(path: Path, search: Search) -> Study:
 
     try:
         storage = JournalStorage(JournalFileBackend(str(path), lock_obj=cast(Any, _Held())))
-        study = optuna.create_study(
-            storage=storage, study_name=_NAME, direction="maximize", pruner=_pruner(search), load_if_exists=True
-        )
+        if _NAME not in optuna.get_all_study_names(storage):
+            optuna.create_study(storage=storage, study_name=_NAME, direction="maximize")
+        study = optuna.load_study(storage=storage, study_name=_NAME, pruner=_pruner(search))
         if not study.user_attrs and not study.trials:
             study.set_user_attr(_SPEC, search.record())
         return study

@@ -3,29 +3,30 @@
 from __future__ import annotations
 
 import math
-import os
 import signal
 import time
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from statistics import fmean
+from typing import TYPE_CHECKING
 
 from metrpo.errors import MetrpoError
 from metrpo.experiments.figures import Run
-from metrpo.experiments.reproduce import _shares_of_cores, _start, rows_of
+from metrpo.experiments.reproduce import _shares_of_cores, rows_of
 from metrpo.experiments.search import Search, worth
 from metrpo.experiments.study import ask, opened_study, taken_up
 from metrpo.experiments.tuned import Tuned, shown, tuned
+from metrpo.experiments.workers import Begin, Cores, Orphan, Worker, begin
+from metrpo.run.metrics import Row
 from metrpo.run.progress import duration
 from metrpo.seeing.watch import is_running
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
+    from optuna.trial import TrialState
 
 Tell = Callable[[str], None]
-Cores = tuple[int, ...]
 _POLL = 0.5
 """Seconds between two looks at the runs."""
 _TAIL = 5
@@ -34,46 +35,28 @@ _HOPELESS = 3
 """Failures in a session before anything goes well, after which no further trial is begun."""
 
 
-class Worker(Protocol):
-    """A run that goes on in another process; `subprocess.Popen` is one."""
-
-    def poll(self) -> int | None:
-        """Its exit code once it has ended."""
-
-    def terminate(self) -> None:
-        """Asks it to stop after its iteration; once more: at once."""
-
-    def wait(self) -> int:
-        """Waits for its end and returns its exit code."""
-
-
-Begin = Callable[[Run, Path, Cores], Worker]
-
-
 @dataclass
 class _Going:
     """A trial that is under way."""
 
     trial: Trial
-    values: dict[str, Any]
     runs: list[Run]
     workers: dict[Run, Worker]
     cores: list[Cores]
     reported: int
-    """Iterations that the pruner has seen."""
+    """Iterations that stand in the study."""
+    judged: int
+    """Iterations after which it was asked whether the trial is bad: one less, where the process ended in between."""
     pruned: int | None
     """The iteration after which it was found bad."""
+    ending: bool = False
     began: float = field(default_factory=time.monotonic)
 
     def stop(self) -> None:
+        """Asks all its runs to end."""
+        self.ending = True
         for worker in self.workers.values():
-            if worker.poll() is None:
-                worker.terminate()
-
-
-def begin(run: Run, out: Path, cores: Cores) -> Worker:
-    """The run as a `metrpo train` of its own on these cores, or the one that is still at it."""
-    return _Orphan(run, out, cores) if is_running(out / run.name) else _start(run, out, cores).process
+            worker.terminate()
 
 
 def tune(search: Search, out: Path, jobs: int, tell: Tell, begin: Begin = begin) -> Tuned:
@@ -134,67 +117,79 @@ class _Tuning:
         frozen = study.get_trials(deepcopy=False)[trial.number]
         runs = search.runs(trial.number, values)
         self._tell(f"trial {trial.number}: {shown(values)}" + ("" if number is None else ", resumed"))
+        reported = max(frozen.intermediate_values, default=0)
         going = _Going(
             trial=trial,
-            values=values,
             runs=runs,
             workers={},
             cores=self._free.pop(0),
-            reported=max(frozen.intermediate_values, default=0),
+            reported=reported,
+            judged=max(0, reported - 1),
             pruned=frozen.user_attrs.get("pruned_after"),
         )
         self._going.append(going)
+        self._report(going)
         for run, cores in zip(runs, going.cores, strict=True):
             if not search.is_spent(rows_of(run, self._out)) and going.pruned is None:
                 going.workers[run] = self._begin(run, self._out, cores)
             elif is_running(self._out / run.name):
-                going.workers[run] = _Orphan(run, self._out, cores)
+                going.workers[run] = Orphan(run, self._out, cores)
         if going.pruned is not None:
             going.stop()
 
     def _look_at(self, going: _Going) -> None:
-        codes = [
-            worker.poll() for worker in going.workers.values()
-        ]  # before the rows: what has ended has written all of them
-        rows = [rows_of(run, self._out) for run in going.runs]
-        whole = all(map(self._search.is_spent, rows))
-        if going.pruned is None:
-            self._report(going, rows, whole)
-        if None in codes:
-            if going.pruned is None and any(codes):  # one seed has failed, which the others cannot mend
-                going.pruned = 0
-                going.stop()
-            return
-        self._going.remove(going)
-        self._free.append(going.cores)
-        self._finish(going, rows, whole)
+        codes = {run: worker.poll() for run, worker in going.workers.items()}  # first: what has ended has written all
+        for run, cores in zip(going.runs, going.cores, strict=True):
+            if codes.get(run) and is_running(self._out / run.name):
+                # It was refused: one that was started just before a kill had not taken its lock when we looked.
+                going.workers[run], codes[run] = Orphan(run, self._out, cores), None
+                if going.ending:
+                    going.workers[run].terminate()
+        self._report(going)
+        if None not in codes.values():
+            self._going.remove(going)
+            self._free.append(going.cores)
+            self._finish(going)
+        elif any(codes.values()) and not going.ending:  # a seed has failed, which the others cannot mend
+            going.stop()
 
-    def _report(self, going: _Going, rows: Sequence[Sequence[Any]], whole: bool) -> None:
+    def _rows(self, going: _Going) -> tuple[list[list[Row]], bool]:
+        """What the trial's runs have measured, and whether that is all."""
+        rows = [rows_of(run, self._out) for run in going.runs]
+        return rows, all(map(self._search.is_spent, rows))
+
+    def _report(self, going: _Going) -> None:
         """Tells the pruner of the iterations that all seeds have finished, and stops the trial if they are bad."""
+        if going.pruned is not None:
+            return
+        rows, whole = self._rows(going)
         measured = min(map(len, rows))
-        for iteration in range(going.reported + 1, measured + 1):
-            each = worth(rows, iteration)
-            going.reported = iteration
-            value = math.fsum(each) / len(each)
-            going.trial.report(value, iteration)
-            self._tell(f"trial {going.trial.number}: iteration {iteration}/{self._search.steps}, return {value:.1f}")
+        for iteration in range(going.judged + 1, measured + 1):
+            going.judged = iteration
+            if iteration > going.reported:
+                value = fmean(worth(rows, iteration))
+                going.trial.report(value, iteration)
+                self._tell(
+                    f"trial {going.trial.number}: iteration {iteration}/{self._search.steps}, return {value:.1f}"
+                )
             if not (whole and iteration == measured) and going.trial.should_prune():
                 going.pruned = iteration
                 going.trial.set_user_attr("pruned_after", iteration)  # stays so when this process is killed meanwhile
                 going.stop()
                 return
 
-    def _finish(self, going: _Going, rows: Sequence[Sequence[Any]], whole: bool) -> None:
+    def _finish(self, going: _Going) -> None:
         trial, took = going.trial, duration(time.monotonic() - going.began)
+        rows, whole = self._rows(going)
         trial.set_user_attr("real_steps", sum(int(r[-1]["real_steps"] or 0) for r in rows if r))
-        each = worth(rows) if all(rows) else []
-        value = math.fsum(each) / len(each) if each else math.nan
-        if whole and math.isfinite(value):
-            trial.set_user_attr("returns", each)
+        returns = worth(rows) if whole else [math.nan]
+        value = fmean(returns)
+        if math.isfinite(value):
+            trial.set_user_attr("returns", returns)
             self._study.tell(trial, value)
             self._hopeful = True
             self._tell(f"trial {trial.number}: return {value:.1f}, in {took}")
-        elif going.pruned:
+        elif going.pruned is not None:
             self._study.tell(trial, state=_state("PRUNED"))
             self._hopeful = True
             self._tell(f"trial {trial.number}: pruned after {going.pruned} iterations, in {took}")
@@ -232,41 +227,7 @@ class _Tuning:
                 worker.wait()
 
 
-class _Orphan:
-    """A run whose `metrpo tune` was killed, while it went on by itself: watched, and taken over once it ends."""
-
-    def __init__(self, run: Run, out: Path, cores: Cores) -> None:
-        self._run, self._out, self._cores = run, out, cores
-        self._asked = False
-        self._process: Worker | None = None
-
-    def poll(self) -> int | None:
-        """Its exit code, 0 for one that ended by itself: what it was before nobody knows."""
-        if self._process is None:
-            if is_running(self._out / self._run.name):
-                return None
-            if self._asked:
-                return 0
-            self._process = _start(self._run, self._out, self._cores).process
-        return self._process.poll()
-
-    def terminate(self) -> None:
-        """Asks whoever holds the run's lock."""
-        self._asked = True
-        if self._process is not None:
-            self._process.terminate()
-        elif is_running(self._out / self._run.name):
-            with suppress(OSError, ValueError):
-                os.kill(int((self._out / self._run.name / ".lock").read_text()), signal.SIGTERM)
-
-    def wait(self) -> int:
-        """Waits for its end."""
-        while (code := self.poll()) is None:
-            time.sleep(_POLL)
-        return code
-
-
-def _state(name: str) -> Any:
+def _state(name: str) -> TrialState:
     from optuna.trial import TrialState
 
     return TrialState[name]
