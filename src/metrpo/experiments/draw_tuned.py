@@ -31,8 +31,8 @@ def draw(tuned: Tuned, path: Path) -> bool:
     if not worth:
         return False
     names = list(tuned.search.space)
-    rows = -(-(1 + len(names)) // _COLUMNS)
-    columns = min(1 + len(names), _COLUMNS)
+    columns = 2 if len(names) == 3 else min(1 + len(names), _COLUMNS)
+    rows = -(-(1 + len(names)) // columns)
     figure = Figure(figsize=(max(4.4 * columns, 6.5), 3.6 * rows + 0.7), dpi=130, layout="constrained")
     first, *panels = figure.subplots(rows, columns, squeeze=False).flat
     _draw_trials(first, worth, tuned)

@@ -26,8 +26,8 @@ _WIDE = 160
 """Columns of the table where no terminal says how many there are."""
 _SHOWN = 10
 """Trials in the table."""
-_ENOUGH = 4
-"""Complete trials, below which nothing is said of a setting's importance."""
+_ENOUGH = 10
+"""Complete trials, below which nothing is said of a setting's importance: it would be that of chance."""
 
 
 @dataclass(frozen=True)

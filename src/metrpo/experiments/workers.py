@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 from metrpo.experiments.figures import Run
-from metrpo.experiments.reproduce import _start
+from metrpo.experiments.reproduce import _start, is_finished
 from metrpo.seeing.watch import is_running
 
 Cores = tuple[int, ...]
@@ -49,11 +49,11 @@ class Orphan:
         self._process: Worker | None = None
 
     def poll(self) -> int | None:
-        """Its exit code, 0 for one that ended by itself: what it was before nobody knows."""
+        """Its exit code; 0 for one that was finished or stopped before it was ours."""
         if self._process is None:
             if is_running(self._out / self._run.name):
                 return None
-            if self._asked:
+            if self._asked or is_finished(self._run, self._out):
                 return 0
             self._process = _start(self._run, self._out, self._cores).process
         return self._process.poll()
