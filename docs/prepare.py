@@ -167,12 +167,12 @@ def _command(name: str, text: str) -> str:
     if not options:
         return shown
     folded = "\n".join(f"    {line}".rstrip() for line in f"```text{colon}{options}\n```".splitlines())
-    return f"{shown}\n??? note \"Every option\"\n\n{folded}\n"
+    return f'{shown}\n??? note "Every option"\n\n{folded}\n'
 
 
 def main() -> int:
     """Writes build/docs, or says what is wrong with the pages and returns 1."""
-    found = re.search(r"^repo_url: *(\S+)", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    found = re.search(r"^  repository: *(\S+)", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
     repository = found[1].rstrip("/") if found else ""
     out, links = ROOT / "build" / "docs", Links([], set(), set())
     shutil.rmtree(out, ignore_errors=True)

@@ -1,8 +1,8 @@
 """The documentation does what it says: links lead somewhere, code runs, commands are commands, nothing is left out.
 
 Code runs in the order of its page, in an empty directory with a committed run in it, and so do the commands that cost
-little. `metrpo.preset` gives brief settings meanwhile (`BRIEF`), so that what trains for minutes takes seconds; all else
-is as printed. A block that cannot run here says why: `<!-- not run: REASON -->` stands above it.
+little. `metrpo.preset` gives brief settings meanwhile (`BRIEF`), so that what trains for minutes takes seconds; all
+else is as printed. A block that cannot run here says why: `<!-- not run: REASON -->` stands above it.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ def test_every_page_stands_in_the_navigation():
     assert sorted(NAVIGATION) == sorted(page.name for page in PAGES if page.parent.name == "docs")
 
 
+@pytest.mark.timeout(600)  # some 20 s of compilation, once, on a quiet machine
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python", *SHELL)], ids=name)
 def test_code_runs_and_cheap_commands_too(workshop, monkeypatch, capsys, page):
     full = presets.preset
@@ -91,7 +92,9 @@ def test_commands_are_understood(workshop, capsys, page):
     for block in blocks(page, "python"):
         save(block)
     commands = [command for block in blocks(page, *SHELL) for command in typed(block)] + mentioned(page)
-    problems = [f"{where}: metrpo {' '.join(words)}\n{problem}" for where, words in commands if (problem := wrong(words))]
+    problems = [
+        f"{where}: {problem}: metrpo {' '.join(words)}" for where, words in commands if (problem := wrong(words))
+    ]
     assert not problems, "\n".join(problems) + capsys.readouterr().err
 
 
