@@ -134,7 +134,7 @@ def check() -> Links:
     links = Links([], set(), set())
     for page in pages():
         with_includes(page, rendered(page, links), links)
-    return links
+    return links._replace(problems=list(dict.fromkeys(links.problems)))  # what is included is met more than once
 
 
 def commands() -> str:
@@ -186,7 +186,7 @@ def main() -> int:
         shutil.copyfile(image, copy)
     links.problems.extend(check().problems)
     print("\n".join(dict.fromkeys(links.problems)), file=sys.stderr, end="\n" if links.problems else "")
-    print(f"{out.relative_to(ROOT)}: {len(links.external)} links to other hosts, not followed")
+    print("Links to other hosts, not followed:", *sorted(links.external), sep="\n  ")
     return 1 if links.problems else 0
 
 

@@ -117,6 +117,16 @@ def wrong(words: list[str]) -> str:
     return ""
 
 
+def test_commands_are_found():
+    """Else nothing would be tried: the README's, in blocks and in sentences."""
+    readme = ROOT / "README.md"
+    found = [command.words for block in blocks(readme, *SHELL) for command in typed(block)]
+    assert ["train", "HalfCheetah", "--seed", "1", "--real-steps", "60000"] in found
+    assert len(found) >= 14
+    assert ["train", "Swimmer", "--seed", "0"] in [command.words for command in mentioned(readme)]
+    assert [block.not_run[:10] for block in blocks(ROOT / "docs" / "tutorial.md", "python")] == ["", "tests/test"]
+
+
 def known() -> set[str]:
     return {command.__name__.lower() for command in typing.get_args(options.Command)}
 
