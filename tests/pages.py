@@ -15,6 +15,8 @@ PLACEHOLDERS = {"TASK": "Swimmer", "FIGURE": "all", "DIR": "runs/a", "FILE": "lo
 _FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1``` *$", re.DOTALL | re.MULTILINE)
 _NOT_RUN = re.compile(r"<!-- not run: ([^>]+?) -->\s*\Z")
 _INLINE = re.compile(r"`(metrpo [^`]+)`")
+_LOGICAL_LINE = re.compile(r"(?:[^\n]*\\\n)*[^\n]+")
+"""Up to an end of line that no backslash takes back."""
 _COMMAND = re.compile(r"(?:\$ +)?(?:\w+=\S* +)*(?:\S*/)?metrpo +(.*)")
 
 
@@ -54,8 +56,9 @@ def blocks(page: Path, *languages: str) -> list[Block]:
 def typed(block: Block) -> list[Command]:
     """The `metrpo` commands of a block of shell lines."""
     found = []
-    for number, line in enumerate(block.code.replace("\\\n", "  ").splitlines(), block.line):
-        for part in re.split(r"\s(?:&&|\|\|?|>|;)\s", line.strip()):
+    for line in _LOGICAL_LINE.finditer(block.code):
+        number = block.line + _line(block.code, line.start()) - 1
+        for part in re.split(r"\s(?:&&|\|\|?|>|;)\s", line[0].replace("\\\n", " ").strip()):
             if command := _COMMAND.fullmatch(part):
                 found.append(_command(block.page, number, command[1]))
     return found

@@ -24,7 +24,7 @@ import probe
 from metrpo import cli, config, options, presets
 from metrpo.errors import TaskError
 from metrpo.run import machine
-from pages import PAGES, ROOT, SHELL, blocks, mentioned, typed
+from pages import PAGES, ROOT, SHELL, Block, blocks, mentioned, typed
 
 BRIEF = probe.BRIEF | {"collect.steps": 400, "collect.max_train": 400, "iterations": 2}
 CHEAP = {"evaluate", "export", "plot", "report", "tasks"}
@@ -124,6 +124,8 @@ def test_commands_are_found():
     assert ["train", "HalfCheetah", "--seed", "1", "--real-steps", "60000"] in found
     assert len(found) >= 14
     assert ["train", "Swimmer", "--seed", "0"] in [command.words for command in mentioned(readme)]
+    two = Block(readme, 7, "sh", "metrpo tasks \\\n  --json\nls && $ metrpo doctor > a  # why\n", "")
+    assert typed(two) == [("README.md:7", ["tasks", "--json"]), ("README.md:9", ["doctor"])]
     assert [block.not_run[:10] for block in blocks(ROOT / "docs" / "tutorial.md", "python")] == ["", "tests/test"]
 
 
