@@ -4,7 +4,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup baselines train test test-slow lock clean
+.PHONY: help setup baselines train test test-slow docs lock clean
 
 PYTHON ?=
 RUN_DIR ?=
@@ -13,6 +13,7 @@ UV ?= uv
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+DOCS := $(VENV)/.docs
 CANDIDATES := $(if $(PYTHON),$(PYTHON),python3.13 python3.12 python3.11 python3)
 FITS := import sys, ensurepip, venv; sys.exit(sys.version_info < (3, 11))
 
@@ -34,6 +35,10 @@ test: $(READY)  ## lint, types, import rules and the fast tests
 test-slow: $(READY)  ## the tests that learn for minutes
 	$(BIN)/pytest -m slow --timeout=1800
 
+docs: $(DOCS)  ## build the documentation in site/; a broken link or anchor stops it
+	$(BIN)/python docs/prepare.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
 setup: $(READY)  ## only set up .venv
 
 # PyTorch by itself first, so that one that is installed already is kept. Not in the lock file: nothing else needs it.
@@ -41,13 +46,16 @@ baselines: $(READY)  ## add what the systems ppo and ddpg need (PyTorch, Stable-
 	$(BIN)/python -m pip install --disable-pip-version-check torch==2.13.0
 	$(BIN)/python -m pip install --disable-pip-version-check 'stable-baselines3>=2.7'
 
-lock:  ## take the newest versions into requirements.lock (needs uv; no other target does)
+lock:  ## take the newest versions into the two lock files (needs uv; no other target does)
 	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --fork-strategy requires-python \
 	  --extra dev --extra video --annotation-style line --custom-compile-command 'make lock' \
 	  --no-emit-index-url --no-emit-find-links pyproject.toml --output-file requirements.lock
+	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --fork-strategy requires-python \
+	  --group docs --constraints requirements.lock --annotation-style line --custom-compile-command 'make lock' \
+	  --no-emit-index-url --no-emit-find-links --output-file requirements-docs.lock
 
-clean:  ## remove .venv and the tools' caches; runs stay
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+clean:  ## remove .venv, the built documentation and the tools' caches; runs stay
+	rm -rf $(VENV) site build/docs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 
 # Made again when the lock file or pyproject.toml is newer. An interrupted set-up leaves no stamp, so it is taken up again.
 $(READY): pyproject.toml requirements.lock
@@ -63,4 +71,8 @@ $(READY): pyproject.toml requirements.lock
 	exit 1
 	$(BIN)/python -m pip install --disable-pip-version-check -r requirements.lock
 	$(BIN)/python -m pip install --disable-pip-version-check --no-deps -e .
+	@touch $@
+
+$(DOCS): requirements-docs.lock $(READY)
+	$(BIN)/python -m pip install --disable-pip-version-check -r requirements-docs.lock
 	@touch $@

@@ -29,7 +29,7 @@ class Log:
 
     def __init__(self, run_dir: Path) -> None:
         self._path, self._metrics = run_dir.with_name(f"{run_dir.name}-soak.csv"), run_dir / "metrics.csv"
-        self._seen = ""
+        self._seen: list[dict[str, str]] = []
         self.events: list[dict[str, str]] = []
         if self._path.exists():
             with self._path.open(newline="") as file:
@@ -37,13 +37,15 @@ class Log:
 
     def write(self, event: str, hours: float, cpu_hours: float) -> None:
         """One more event; raises `SystemExit` when a row of the metrics is lost or changed."""
-        rows = self._metrics.read_text() if self._metrics.exists() else ""
-        if not rows.startswith(self._seen):
+        rows = list(csv.DictReader(self._metrics.read_text().splitlines())) if self._metrics.exists() else []
+        # By column: a newer version adds some to the rows of before.
+        kept = [{name: new.get(name) for name in old} for old, new in zip(self._seen, rows, strict=False)]
+        if kept != self._seen:
             raise SystemExit(f"{event}: the rows of {self._metrics} are not those of before")
         self._seen = rows
         since = f"{time.time() - self._metrics.stat().st_mtime:.1f}" if rows else ""
         now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-        values = (now, event, f"{hours:.4f}", f"{cpu_hours:.4f}", str(max(rows.count("\n") - 1, 0)), since)
+        values = (now, event, f"{hours:.4f}", f"{cpu_hours:.4f}", str(len(rows)), since)
         self.events.append(dict(zip(COLUMNS, values, strict=True)))
         with self._path.open("a", newline="") as file:
             writer = csv.DictWriter(file, COLUMNS)

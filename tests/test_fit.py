@@ -15,6 +15,7 @@ from metrpo.config import FitConfig
 from metrpo.model import ensemble as ensembles
 from metrpo.model import fit as fitting
 from metrpo.model.ensemble import Ensemble
+from metrpo.model.passes import minibatch, train_and_validate
 from metrpo.types import Transitions
 
 KEY = jax.random.key(0)
@@ -102,14 +103,11 @@ def slow_fit(ensemble, k, train, validation, config):
     for passes in range(config.validate_every, config.max_passes + 1, config.validate_every):
         block = jax.random.fold_in(KEY, passes)
         for i in range(steps):
-            index = minibatch(jax.random.fold_in(block, i), ensemble.members, config.batch_size, train.size)[k]
+            index = minibatch(jax.random.fold_in(block, i), jnp.arange(k, k + 1), config.batch_size, train.size)[0]
             slow.step([x[np.asarray(index)].astype(float) for x in train[:3]])
         losses.append(slow.loss(validation))
         layers.append([tuple(x) for x in slow.layers])
     return np.array(losses), layers
-
-
-minibatch = jax.jit(fitting.minibatch, static_argnums=(1, 2))
 
 
 NOISY = FitConfig(learning_rate=0.03, batch_size=10, validate_every=2, max_passes=16, patience=99)
@@ -193,6 +191,20 @@ def test_the_first_member_of_many_is_the_only_member_of_one():
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
+def test_members_trained_at_once_end_as_members_trained_one_after_another(monkeypatch):
+    """As on a GPU, and as on a CPU."""
+    train, validation = a_system(60)[0], a_system(30, seed=1)[0]
+    start = random_ensemble(1)._replace(normaliser=ensembles.normaliser_of(train, 0.1, 0.1))
+    found = []
+    for backend in ("cpu", "gpu"):
+        monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
+        train_and_validate.clear_cache()
+        found.append(fit(start.networks, start.normaliser, train, validation, SHORT, KEY))
+    train_and_validate.clear_cache()
+    for ours, theirs in zip(*map(jax.tree.leaves, found), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-5)
+
+
 def test_a_diverged_member_keeps_its_best_weights():
     train, validation = a_system(60)[0], a_system(30, seed=1)[0]
     start = random_ensemble(2)._replace(normaliser=ensembles.normaliser_of(train, 0.1, 0.1))
@@ -227,12 +239,12 @@ def test_fitting_stops_when_no_member_has_improved_for_the_patience(monkeypatch,
     config = FitConfig(**settings)
     trained = []
 
-    def scripted(at, normaliser, train, validation, config, key, steps, after):
+    def scripted(at, normaliser, train, validation, config, mesh, key, steps, after):
         trained.append((int(after), int(steps)))
         better = jnp.array([int(after) in list(script) for script in improvements])
         return at._replace(best_pass=jnp.where(better, after, at.best_pass), best_loss=at.best_loss - better)
 
-    monkeypatch.setattr(fitting, "_train_and_validate", scripted)
+    monkeypatch.setattr(fitting, "train_and_validate", scripted)
     told = []
     ensemble = random_ensemble(0, members=2, hidden=())
     train = random_transitions(np.random.default_rng(0), 3500, capacity=5000)
@@ -302,7 +314,7 @@ def test_fitting_learns_a_known_system():
 
 def test_minibatches_are_uniform_and_independent():
     keys = jax.random.split(jax.random.key(1), 300)
-    index = np.asarray(jax.vmap(lambda k: fitting.minibatch(k, 3, 10, 7))(keys))
+    index = np.asarray(jax.vmap(lambda k: minibatch(k, jnp.arange(3), 10, 7))(keys))
     assert (index.min(), index.max()) == (0, 6)
     for k in range(3):
         assert stats.chisquare(np.bincount(index[:, k].ravel(), minlength=7)).pvalue > 1e-3

@@ -327,7 +327,7 @@ class Blocks:
     """Spoils the networks of member `k` before the training blocks that `when` chooses by their number."""
 
     def __init__(self, monkeypatch, k, value, when):
-        self.count, block = 0, fitting._train_and_validate
+        self.count, block = 0, fitting.train_and_validate
 
         def spoilt(at, *args):
             self.count += 1
@@ -335,7 +335,7 @@ class Blocks:
                 at = at._replace(networks=jax.tree.map(lambda x: x.at[k].set(value), at.networks))
             return block(at, *args)
 
-        monkeypatch.setattr(fitting, "_train_and_validate", spoilt)
+        monkeypatch.setattr(fitting, "train_and_validate", spoilt)
 
 
 def second_fit(clean):

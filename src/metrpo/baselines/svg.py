@@ -22,7 +22,7 @@ from metrpo.config import Config
 from metrpo.errors import ConfigError
 from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Ensemble, Networks, predict
-from metrpo.model.fit import loss_of, minibatch
+from metrpo.model.passes import loss_of, minibatch
 from metrpo.policy import gaussian
 from metrpo.policy.advantage import discounted_returns
 from metrpo.policy.ascent import ascend, init_moments
@@ -224,7 +224,7 @@ def _train_model(
 
     def step(carry: tuple[Networks, Any], key: Array) -> tuple[tuple[Networks, Any], Array]:
         networks, moments = carry
-        index = minibatch(key, 1, batch_size, replay.size)
+        index = minibatch(key, jnp.arange(1), batch_size, replay.size)
         now, gradient = jax.value_and_grad(loss)(networks, *(jnp.take(x, index, axis=0) for x in replay[:3]))
         change, moments = optimizer.update(gradient, moments)
         return (optax.apply_updates(networks, change), moments), now

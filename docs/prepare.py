@@ -1,0 +1,194 @@
+"""Prepares the documentation for the site generator: `python docs/prepare.py` writes `build/docs` (see `make docs`).
+
+The pages are read on a code host as they are, with links from `docs/` into the whole tree. A site holds `docs/` alone,
+so here every such link is checked and given a place in the site. And two comments are filled in:
+
+    <!-- from README.md: The loop -->     a section of a file of the tree (without a name: all of it)
+    <!-- commands -->                     every command's --help, from the parser itself
+
+Nothing here knows the generator: it finds plain Markdown, and whatever is wrong has been said before, with its line.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import shutil
+import sys
+import typing
+from pathlib import Path
+from typing import NamedTuple
+from urllib.parse import urlsplit
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+ELSEWHERE = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
+"""Pages whose text lives outside of docs/, and where the site shows them."""
+IMAGES = {".png", ".svg", ".gif", ".jpg"}
+WIDTH = 80
+"""Of the commands' help, in characters: what fits beside the navigation."""
+_FENCE = re.compile(r"^( *)(```+).*?^\1\2 *$\n?", re.DOTALL | re.MULTILINE)
+_CODE_OR_LINK = re.compile(r"(`+)(?!`)(?:(?!\n\n).)*?\1(?!`)|\[((?:`[^`]*`|[^\[\]`])*)\]\(([^()\s]+)\)", re.DOTALL)
+_INCLUDE = re.compile(r"^<!-- from ([\w./-]+)(?:: (.+?))? -->$", re.MULTILINE)
+
+
+class Links(NamedTuple):
+    """What the links of all pages lead to."""
+
+    problems: list[str]
+    external: set[str]
+    images: set[Path]
+    """Outside of docs/; the site needs a copy."""
+
+
+def pages() -> list[Path]:
+    """Every page of the site, and the files that some take their text from."""
+    return [*sorted(DOCS.glob("*.md")), *(ROOT / name for name in ELSEWHERE)]
+
+
+def rendered(page: Path, links: Links, repository: str = "") -> str:
+    """The page's text with links as the site has them; what is wrong with them goes to `links`.
+
+    Links to files that are no pages lead to `repository`; without one, their text stays and the link goes.
+    """
+    text, parts, done = page.read_text(), [], 0
+    for fence in [*_FENCE.finditer(text), None]:
+        end = len(text) if fence is None else fence.start()
+
+        def link(found: re.Match[str], start: int = done) -> str:
+            if found[3] is None:
+                return found[0]
+            where = f"{page.relative_to(ROOT)}:{text.count(chr(10), 0, start + found.start()) + 1}"
+            target = _target(page, found[3], where, links, repository)
+            return found[2] if target is None else f"[{found[2]}]({target})"
+
+        parts += [_CODE_OR_LINK.sub(link, text[done:end]), "" if fence is None else fence[0]]
+        done = end if fence is None else fence.end()
+    return "".join(parts)
+
+
+def _target(page: Path, raw: str, where: str, links: Links, repository: str) -> str | None:
+    """Where the link leads in the site; None when the file has no place there."""
+    if urlsplit(raw).scheme:
+        if urlsplit(raw).scheme != "https" or "." not in urlsplit(raw).netloc:
+            links.problems.append(f"{where}: expected https://HOST/..., got {raw}")
+        links.external.add(raw)
+        return raw
+    path, hash_sign, anchor = raw.partition("#")
+    file = (page.parent / path).resolve() if path else page
+    if not file.exists() or not file.is_relative_to(ROOT):
+        links.problems.append(f"{where}: expected a file of the tree, got {raw}")
+        return raw
+    if anchor and anchor not in anchors(file):
+        links.problems.append(f"{where}: {file.name} has no heading #{anchor}")
+    name = str(file.relative_to(ROOT))
+    if not path:
+        return raw
+    if file.is_relative_to(DOCS):
+        return f"{file.relative_to(DOCS)}{hash_sign}{anchor}"
+    if name in ELSEWHERE:
+        return f"{ELSEWHERE[name]}{hash_sign}{anchor}"
+    if file.suffix in IMAGES:
+        links.images.add(file)
+        return f"tree/{name}"
+    return f"{repository}/{'tree' if file.is_dir() else 'blob'}/main/{name}" if repository else None
+
+
+def anchors(page: Path) -> set[str]:
+    """The names that the page's headings have in links."""
+    if page.suffix != ".md":
+        return set()
+    headings = re.findall(r"^#+ +(.+?)\s*$", _FENCE.sub("", page.read_text()), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+def section(text: str, name: str | None) -> str | None:
+    """What stands between the heading `name` and the next one; all of `text` without a name; None: not there."""
+    if name is None:
+        return text
+    outside = _FENCE.sub(lambda fence: re.sub(r"\S", "x", fence[0]), text)  # where no comment looks like a heading
+    found = re.search(rf"^#+ {re.escape(name)}$\n", outside, re.MULTILINE)
+    if found is None:
+        return None
+    end = re.compile(r"^#+ ", re.MULTILINE).search(outside, found.end())
+    return text[found.end() : end.start() if end else None].strip() + "\n"
+
+
+def with_includes(page: Path, text: str, links: Links, repository: str = "") -> str:
+    """The text with other files' sections in the place of the comments that ask for them."""
+
+    def include(found: re.Match[str]) -> str:
+        file = ROOT / found[1]
+        part = section(rendered(file, links, repository), found[2]) if file.is_file() else None
+        if part is None:
+            links.problems.append(f"{page.relative_to(ROOT)}: expected a section of the tree's files, got {found[0]}")
+        return part or ""
+
+    return _INCLUDE.sub(include, text)
+
+
+def check() -> Links:
+    """All links of all pages, followed: those to other hosts are looked at and not asked for."""
+    links = Links([], set(), set())
+    for page in pages():
+        with_includes(page, rendered(page, links), links)
+    return links._replace(problems=list(dict.fromkeys(links.problems)))  # what is included is met more than once
+
+
+def commands() -> str:
+    """A section for every command that the parser knows: what --help prints, without its boxes."""
+    from metrpo import options
+
+    names = [command.__name__.lower() for command in typing.get_args(options.Command)]
+    return "\n".join(_command(name, _help(options.parse, name)) for name in names)
+
+
+def _help(parse: typing.Callable[[list[str]], object], name: str) -> str:
+    printed = io.TextIOWrapper(io.BytesIO(), encoding="utf-8")  # it draws other boxes where it may not write these
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = str(WIDTH)
+    try:
+        with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+            parse([name, "--help"])
+    finally:
+        os.environ.pop("COLUMNS") if before is None else os.environ.update(COLUMNS=before)
+    printed.seek(0)
+    text = re.sub(r"^╭─ (.*?) ─*╮$", r"\1:", printed.read(), flags=re.MULTILINE)
+    text = re.sub(r"^╰─*╯$", "", text, flags=re.MULTILINE)
+    return re.sub(r"^│(.*?) *│$", r" \1", text, flags=re.MULTILINE).strip()
+
+
+def _command(name: str, text: str) -> str:
+    """The options of a long help are folded in."""
+    text, colon, options = text.partition("\npositional arguments:") if text.count("\n") > 100 else (text, "", "")
+    shown = f"## metrpo {name}\n\n```text\n{text.strip()}\n```\n"
+    if not options:
+        return shown
+    folded = "\n".join(f"    {line}".rstrip() for line in f"```text{colon}{options}\n```".splitlines())
+    return f'{shown}\n??? note "Every option"\n\n{folded}\n'
+
+
+def main() -> int:
+    """Writes build/docs, or says what is wrong with the pages and returns 1."""
+    found = re.search(r"^  repository: *(\S+)", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    repository = found[1].rstrip("/") if found else ""
+    out, links = ROOT / "build" / "docs", Links([], set(), set())
+    shutil.rmtree(out, ignore_errors=True)
+    shutil.copytree(DOCS, out, ignore=shutil.ignore_patterns("*.md", "*.py", "__pycache__"))
+    for page in sorted(DOCS.glob("*.md")):
+        text = with_includes(page, rendered(page, links, repository), links, repository)
+        (out / page.name).write_text(re.sub(r"^<!-- commands -->$", lambda _: commands(), text, flags=re.MULTILINE))
+    for image in links.images:
+        copy = out / "tree" / image.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(image, copy)
+    links.problems.extend(check().problems)
+    print("\n".join(dict.fromkeys(links.problems)), file=sys.stderr, end="\n" if links.problems else "")
+    print("Links to other hosts, not followed:", *sorted(links.external), sep="\n  ")
+    return 1 if links.problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,168 @@
+"""Passes over the training set: Adam on the L2 one-step loss, every member on its own minibatches, then a validation.
+
+Paper, section 4.1 (eq. 1) and appendix A.1.2 (batch, passes).
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.sharding import Mesh, PartitionSpec
+
+from metrpo.config import FitConfig
+from metrpo.model.ensemble import Ensemble, Networks, predict_delta, with_products
+from metrpo.types import Array, Normaliser, Transitions
+
+VALIDATION_CHUNK = 1000
+"""Validation transitions per product; bounds memory and keeps shapes fixed as data grows."""
+
+
+class _Training(NamedTuple):
+    networks: Networks
+    optimizer: optax.OptState
+    train_loss: Array
+
+
+class Progress(NamedTuple):
+    """Where a fit stands; all but Adam's count has the members first."""
+
+    networks: Networks
+    optimizer: optax.OptState
+    best_networks: Networks
+    best_loss: Array
+    best_pass: Array
+    train_loss: Array
+
+
+def loss_of(ensemble: Ensemble, loss_units: str, states: Array, actions: Array, deltas: Array) -> Array:
+    """[K, B]: squared error of the predicted change, summed over state dimensions (paper, eq. 1).
+
+    In "raw" state units (the paper), or each dimension in units of its "std", so that none drowns another.
+    """
+    errors = predict_delta(ensemble, states, actions) - deltas
+    if loss_units == "std":
+        errors = errors / ensemble.normaliser.delta_std
+    return jnp.sum(jnp.square(errors), axis=-1)
+
+
+@partial(jax.jit, static_argnames="loss_units")
+def validation_loss(ensemble: Ensemble, validation: Transitions, loss_units: str = "raw") -> Array:
+    """[K]: mean of `loss_of` over the first `size` validation transitions; the capacity beyond costs nothing."""
+    members = ensemble.members
+    capacity = validation.states.shape[0]
+
+    def chunk_sum(i: Array, total: Array) -> Array:
+        index = i * VALIDATION_CHUNK + jnp.arange(VALIDATION_CHUNK)
+        rows = [jnp.take(x, index, axis=0, mode="clip") for x in validation[:3]]
+        losses = loss_of(ensemble, loss_units, *(jnp.broadcast_to(x, (members, *x.shape)) for x in rows))
+        return total + jnp.sum(jnp.where(index < jnp.minimum(validation.size, capacity), losses, 0.0), axis=-1)
+
+    chunks = (validation.size + VALIDATION_CHUNK - 1) // VALIDATION_CHUNK
+    return jax.lax.fori_loop(0, chunks, chunk_sum, jnp.zeros(members)) / validation.size
+
+
+@partial(jax.jit, static_argnames=("config", "mesh"), donate_argnums=0)
+def train_and_validate(
+    at: Progress,
+    normaliser: Normaliser,
+    train: Transitions,
+    validation: Transitions,
+    config: FitConfig,
+    mesh: Mesh,
+    key: Array,
+    steps: Array,
+    passes: Array,
+) -> Progress:
+    """`steps` minibatches for every member, each device of `mesh` with its own members, then one validation."""
+    whole = PartitionSpec()
+    own = jax.tree.map(lambda x: PartitionSpec(*mesh.axis_names) if x.ndim else whole, at)
+    block = partial(_block, config=config, axis=mesh.axis_names[0])
+    specs = (own, whole, whole, whole, whole, whole, whole)
+    shared = jax.shard_map(block, mesh=mesh, in_specs=specs, out_specs=own, check_vma=False)
+    return shared(at, normaliser, train, validation, key, steps, passes)
+
+
+def _block(
+    at: Progress,
+    normaliser: Normaliser,
+    train: Transitions,
+    validation: Transitions,
+    key: Array,
+    steps: Array,
+    passes: Array,
+    config: FitConfig,
+    axis: str,
+) -> Progress:
+    """One device's share of `train_and_validate`."""
+    optimizer = optimizer_of(config)
+    members = at.best_loss.shape[0]
+    first = jax.lax.axis_index(axis) * members
+    block_key = jax.random.fold_in(key, passes)
+
+    def total_loss(networks: Networks, *batch: Array) -> tuple[Array, Array]:
+        ensemble = Ensemble(with_products(networks, config.products), normaliser)
+        losses = jnp.mean(loss_of(ensemble, config.loss_units, *batch), axis=-1)
+        return jnp.sum(losses), losses
+
+    def train_group(group: _Training, numbers: Array, key: Array) -> _Training:
+        index = minibatch(key, numbers, config.batch_size, train.size)
+        batch = (jnp.take(x, index, axis=0) for x in train[:3])
+        gradient, losses = jax.grad(total_loss, has_aux=True)(group.networks, *batch)
+        change, optimizer_state = optimizer.update(gradient, group.optimizer, group.networks)
+        return _Training(optax.apply_updates(group.networks, change), optimizer_state, losses)
+
+    def step(i: Array, groups: list[_Training]) -> list[_Training]:
+        step_key = jax.random.fold_in(block_key, i)
+        numbers = jnp.split(first + jnp.arange(members), len(groups))
+        return [train_group(group, n, step_key) for group, n in zip(groups, numbers, strict=True)]
+
+    # On a CPU one member after another, for what one computes stays in the cache; a GPU wants them all at once.
+    apart = members if jax.default_backend() == "cpu" else 1
+    groups = _split(_Training(at.networks, at.optimizer, at.train_loss), apart)
+    networks, optimizer_state, train_loss = _joined(jax.lax.fori_loop(0, steps, step, groups))
+    loss = validation_loss(Ensemble(networks, normaliser), validation, config.loss_units)
+    better = loss < at.best_loss  # False for NaN: a diverged member keeps its best weights
+
+    def keep_best(new: Array, best: Array) -> Array:
+        return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, best)
+
+    return Progress(
+        networks,
+        optimizer_state,
+        jax.tree.map(keep_best, networks, at.best_networks),
+        jnp.where(better, loss, at.best_loss),
+        jnp.where(better, passes, at.best_pass),
+        train_loss,
+    )
+
+
+def _split(x: Any, count: int) -> list[Any]:
+    """`count` pytrees out of one whose arrays have the members first; scalars (Adam's count) go to each."""
+    leaves, shape = jax.tree.flatten(x)
+    pieces = [jnp.split(leaf, count) if leaf.ndim else [leaf] * count for leaf in leaves]
+    return [jax.tree.unflatten(shape, parts) for parts in zip(*pieces, strict=True)]
+
+
+def _joined(parts: list[Any]) -> Any:
+    """What `_split` took apart."""
+    return jax.tree.map(lambda *a: jnp.concatenate(a) if a[0].ndim else a[0], *parts)
+
+
+def optimizer_of(config: FitConfig) -> optax.GradientTransformation:
+    """Adam, with weight decay on the weights alone."""
+    return optax.adamw(config.learning_rate, weight_decay=config.weight_decay, mask=_weights_only)
+
+
+def _weights_only(networks: Networks) -> tuple[tuple[bool, bool], ...]:
+    return tuple((True, False) for _ in networks)
+
+
+def minibatch(key: Array, numbers: Array, batch_size: int, size: Array) -> Array:
+    """[K, B] indices below `size`, with replacement, for the members `numbers` [K]; each one's depend on its number and
+    `key` alone."""
+    keys = jax.vmap(partial(jax.random.fold_in, key))(numbers)
+    return jax.vmap(lambda k: jax.random.randint(k, (batch_size,), 0, size))(keys)
