@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -591,3 +593,30 @@ def test_killed_together_with_its_run_it_goes_on_from_the_checkpoint(tmp_path):
         assert cli.main(words) == 0
     assert "trial-000" in page.read_text()
     assert cli.main(["plot", str(out), "--out", str(tmp_path / "curves.png")]) == 0
+
+
+# ---------------------------------------------------------------- the committed search
+
+
+def test_the_committed_search_is_what_its_page_says(tmp_path):
+    root = Path(__file__).parents[1]
+    page = (root / "docs" / "tuning.md").read_text()
+    line = next(part for part in page.split("```") if "--out results/tune" in part).replace("\\\n", " ")
+    asked = as_typed(options.parse(shlex.split(line)[1:]))
+    shutil.copy(root / "results" / "tune" / FILE, tmp_path)
+    found = tune(asked, tmp_path, 1, silent, Fake())
+    assert (len(found.records), sum(r.state == "pruned" for r in found.records)) == (8, 2)
+    for r in found.records:
+        rows = [tuning.rows_of(run, root / "results" / "tune") for run in asked.runs(r.number, r.settings)]
+        assert r.real_steps == sum(one[-1]["real_steps"] for one in rows)
+        if r.state == "pruned":
+            assert f"{r.value:.0f}" in page
+            continue
+        assert worth(rows) == r.returns
+        returns = ", ".join(f"{value:.1f}" for value in r.returns)
+        assert re.search(rf"\| {r.number}\D* \| {r.value:.1f} \| {returns} \|", page)
+    assert f"{64_000 - sum(r.real_steps for r in found.records):,} of 64,000" in page
+    for trial in ("trial-003", "trial-000"):
+        again = sorted((root / "results" / "tune-again" / "Pendulum-v1" / trial).glob("seed-*/metrics.csv"))
+        each = worth([read_metrics(path) for path in again])
+        assert f"{sum(each) / 3:.1f} ({', '.join(f'{value:.1f}' for value in each)})" in page
