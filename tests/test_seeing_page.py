@@ -30,12 +30,26 @@ VOID = {"meta", "br", "img"}
 LOADING = {"src", "srcset", "poster", "data", "action", "background", "xlink:href", "formaction", "ping", "cite"}
 
 
-def a_run(folder, config=CONFIG, rows=None):
+def details(count=12, dimensions=4):
+    """diagnostics.csv of the healthy run; after a whole episode, dimension 2 is worse than no change, and model 3 never
+    agrees."""
+    worse = lambda k, d: 1.7 if (k, d) == ("T", 2) else 0.1 * (d + 1)  # noqa: E731
+    return [
+        {"iteration": i, "real_steps": 3000 * i}
+        | {f"error_{k}_{d}": worse(k, d) for k in ("1", "5", "T") for d in range(dimensions)}
+        | {f"improved_{k}": 0.0 if k == 3 else 0.8 for k in range(5)}
+        for i in range(1, count + 1)
+    ]
+
+
+def a_run(folder, config=CONFIG, rows=None, diagnostics=None):
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(to_json(config))
     rows = healthy() if rows is None else rows
     if rows:
         (folder / "metrics.csv").write_text(to_csv(rows))
+    if diagnostics:
+        (folder / "diagnostics.csv").write_text(to_csv(diagnostics))
     return folder
 
 
@@ -156,6 +170,7 @@ def test_what_a_run_says_is_text_and_no_markup(tmp_path):
     a_run(tmp_path / "other", dataclasses.replace(evil, seed=1, system="k-1", preset="paper"), rows)
     (tmp_path / "<i>damaged").mkdir()
     (tmp_path / "<i>damaged" / "metrics.csv").write_text("<u>")
+    (tmp_path / "other" / "diagnostics.csv").write_text('iteration,real_steps,"error_1_0","<u>"\n1,3000,0.5,1\n')
     found = parsed([tmp_path], tmp_path)
     assert not {"script", "img", "b>", "i>", "u", "del", "ins"} & set(found.tags)
     assert found.references == []
@@ -306,8 +321,12 @@ def test_no_numbers_are_too_odd():
         for config in (CONFIG, ONE):
             assert all(concern.text for concern in examine(rows, config))
         if trial % 5 == 0:
-            found = Found([SeenRun(Path("a"), CONFIG, rows), SeenRun(Path("b"), ONE, rows)], [])
-            Page(page(found, Path()))
+            odd = [{n: draw.choice(values) if "_" in n else v for n, v in row.items()} for row in details()]
+            odd = [{**row, "real_steps": 3000 * row["iteration"]} for row in odd]
+            found = Found([SeenRun(Path("a"), CONFIG, rows, odd), SeenRun(Path("b"), ONE, rows)], [])
+            text = page(found, Path())
+            Page(text)
+            assert not re.search(r'="[^"<>a-z]*\b(nan|inf)\b', text), "no coordinate is nan"
             assert json.dumps(record(found))
             assert standing(found.runs[0]).iteration == len(rows)
 
