@@ -14,7 +14,7 @@ import numpy as np
 from metrpo.run.metrics import is_clock
 from metrpo.seeing import svg
 from metrpo.seeing.concern import Concern
-from metrpo.seeing.curves import FAR, curve, x_axis
+from metrpo.seeing.curves import FAR, RATIOS, curve, x_axis
 from metrpo.seeing.figure import count, figure, swatches
 from metrpo.seeing.runs import Group, SeenRun
 from metrpo.seeing.svg import Line, bars, chart
@@ -49,10 +49,8 @@ _OWN = (
     "disagreement_real",
 )
 """Columns that are shown elsewhere."""
-_RATIO = ("error_", "disagreement_")
-"""Columns that begin so are drawn on a logarithmic axis."""
-_TRUST = (*_RATIO, "outside")
-"""Those that `trust_of` draws for each run."""
+_TRUST = (*RATIOS, "outside")
+"""Columns that begin so are drawn by `trust_of` for each run."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +137,7 @@ def _across(seen: list[Seen], name: str, title: str, note: str, zero: bool, x: s
         return ""
     frame, ends = _robust([line.y for line in lines]) if name == "gap" else None, [line.x[-1] for line in lines]
     log = x == "real_steps" and max(ends) > FAR * min(ends)
-    log_y, mark = name.startswith(_RATIO), 1.0 if name.startswith("error_") else None
+    log_y, mark = name.startswith(RATIOS), 1.0 if name.startswith("error_") else None
     alone = len(lines) == 1
     drawn = chart(title, lines, x_label, "", frame=frame, zero=zero, log=log, say_beyond=alone, log_y=log_y, mark=mark)
     return figure(title, note, drawn)

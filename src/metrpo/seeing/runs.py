@@ -32,8 +32,11 @@ class SeenRun:
     """Of diagnostics.csv, each with its iteration; none of a run from before it was written."""
 
     def column(self, name: str) -> np.ndarray:
-        """One number an iteration; NaN where there is none."""
-        return column(self.rows, name)
+        """One number an iteration, of metrics.csv or else of diagnostics.csv; NaN where there is none."""
+        if not self.details or any(name in row for row in self.rows):
+            return column(self.rows, name)
+        by_iteration = {row["iteration"]: row for row in self.details}
+        return column([by_iteration.get(row["iteration"], {}) for row in self.rows], name)
 
 
 class Skipped(NamedTuple):
