@@ -84,6 +84,7 @@ CASES = [
     ("no-improvement", changed(1, return_real=5.0, gap=0.0), CONFIG, 1, "No return above the first one, 5, in 12"),
     ("few-evaluation-episodes", changed(1, return_real_std=900.0), CONFIG, 1, "Standard error of the return 201"),
     ("member-apart", changed(7, validation_loss_3=9.0), CONFIG, 7, "Validation loss of model 3 is 9"),
+    ("models-blind", changed(8, error_1=1.4), CONFIG, 8, "Model error 1.4 times that of predicting no change"),
     (
         "validation-loss-rising",
         changed(8, **{f"validation_loss_{k}": 20.0 for k in range(5)}),
@@ -135,6 +136,22 @@ def test_settings_count():
     assert "few-evaluation-episodes" in codes(healthy(), dataclasses.replace(CONFIG, evaluation_episodes=1))
     helps = {c.code: c.help for c in examine(exploiting(), ONE_MODEL)}
     assert helps["model-exploited"].startswith("five models instead of one (ensemble.members)")
+
+
+def test_an_exploited_run_says_where_its_models_fail():
+    def meaning(**columns):
+        return next(c.meaning for c in examine([r | columns for r in exploiting()], CONFIG) if "exploited" in c.code)
+
+    assert meaning(outside=0.64, error_5=0.9, error_T=0.99).endswith(
+        "errors (64% of the imagined states lie outside the data)"
+    )
+    assert meaning(outside=0.0, error_5=1.2, error_T=NAN).endswith(
+        "errors (after 5 steps predictions are worse than no change)"
+    )
+    assert meaning(outside=1.0, error_T=3.0).endswith(
+        "states lie outside the data, and after an imagined episode predictions are worse than no change)"
+    )
+    assert meaning(outside=NAN, error_5=NAN, error_T=NAN).endswith("the policy exploits the models' errors")
 
 
 def test_negative_returns_and_returns_through_zero():

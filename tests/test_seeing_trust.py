@@ -94,7 +94,7 @@ def test_the_heat_map_shows_which_dimension_and_after_how_many_steps(tmp_path):
     made = picture(drawn(tmp_path / "a"), "Model error by state dimension")
     assert "largest 1.7, of dimension 2 after an imagined episode; 1 of 12 above 1" in made
     assert re.findall(r'"end"[^>]*>([^<]*)<', made) == ["s[0]", "s[1]", "s[2]", "s[3]"]
-    assert re.findall(r'mid in"[^>]*>([^<]*)<', made)[6:9] == ["0.3", "0.3", "1.7"]
+    assert re.findall(r'mid in"[^>]*>([^<]*)<', made)[6:9] == ["0.30", "0.30", "1.7"]
     assert [style for style, _ in cells(made)] == ["c0"] * 8 + ["c3"] + ["c0"] * 3
     strengths = [strength for _, strength in cells(made)]
     assert strengths[0] < strengths[3] < strengths[6] < strengths[9], "the larger the error, the stronger"
@@ -156,13 +156,13 @@ def test_one_model_has_nobody_to_disagree_with(tmp_path):
 def test_a_damaged_file_of_diagnostics_is_named_and_the_run_stays(tmp_path):
     good = to_csv(details())
     for i, text in enumerate(
-        (good[: len(good) // 2], "", good.replace("\n3,", "\n2,"), "\0", good.replace("0.8", "x"))
+        (good[: len(good) // 2], "", good.replace("\n3,", "\n2,"), "\0", good.replace("0.8", "x"), good[:-2])
     ):
         run = a_run(tmp_path / str(i), dataclasses.replace(CONFIG, seed=i))
         (run / "diagnostics.csv").write_text(text)
     found = find([tmp_path])
-    assert len(found.runs) == 5
-    assert [skipped.path.name for skipped in found.skipped] == ["diagnostics.csv"] * 5
+    assert len(found.runs) == 6
+    assert [skipped.path.name for skipped in found.skipped] == ["diagnostics.csv"] * 6
     text = Page(page(found, tmp_path)).text
     assert "0/diagnostics.csv" in text
     assert "Model error by dimension" not in text

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 
 import numpy as np
 
-from metrpo.run.metrics import Row
+from metrpo.seeing.concern import after, horizons
 from metrpo.seeing.figure import figure
 from metrpo.seeing.heat import heat
 from metrpo.seeing.runs import SeenRun, column
@@ -29,19 +28,13 @@ def trust_of(run: SeenRun, x: str, x_label: str) -> str:
     return "".join([*drawn, _errors_by_dimension(run), _agreement(run)])
 
 
-def horizons(rows: Sequence[Row]) -> list[str]:
-    """The numbers of steps whose errors were measured at all, least first: "1", "5", ..., "T"."""
-    names = [found[1] for name in (rows[0] if rows else ()) if (found := re.fullmatch(r"error_(\d+|T)", name))]
-    return [name for name in names if np.isfinite(column(rows, f"error_{name}")).any()]
-
-
 def _errors(run: SeenRun, x: str, x_label: str) -> str:
     known = horizons(run.rows)
     if not known:
         return ""
     few = len(run.rows) <= _DOTTED
     lines = [
-        Line(run.column(x), run.column(f"error_{k}"), _after(k), f"c{i}{' thick' * (k in ('1', 'T'))}", dots=few)
+        Line(run.column(x), run.column(f"error_{k}"), after(k), f"c{i}{' thick' * (k in ('1', 'T'))}", dots=few)
         for i, k in enumerate(known)
     ]
     drawn = chart("Model error by steps predicted", lines, x_label, "", log_y=True, mark=1.0)
@@ -64,7 +57,7 @@ def _errors_by_dimension(run: SeenRun) -> str:
     d, k = np.unravel_index(int(np.argmax(sizes)), sizes.shape)
     said = (
         f"Model error by state dimension and steps predicted: largest {number(values[d, k])}, of dimension "
-        f"{dimensions[d]} after {_after(known[k])}; {(values[finite] > 1).sum()} of {finite.sum()} above 1"
+        f"{dimensions[d]} after {after(known[k])}; {(values[finite] > 1).sum()} of {finite.sum()} above 1"
     )
     shown = np.sort(np.argsort(-sizes.max(axis=1), kind="stable")[:_DIMENSIONS])
     rows, columns = [f"s[{dimensions[i]}]" for i in shown], ["episode" if k == "T" else k for k in known]
@@ -122,11 +115,7 @@ def _of_error(value: float) -> tuple[str, float]:
 
 def _short(value: float) -> str:
     """Two digits, for a cell."""
-    return f"{value:.2g}" if value < 99.5 else number(value)
-
-
-def _after(steps: str) -> str:
-    return {"1": "1 step", "T": "an imagined episode"}.get(steps, f"{steps} steps")
+    return f"{value:#.2g}" if value < 9.95 else f"{value:.0f}" if value < 1000 else number(value)
 
 
 def _mean(values: np.ndarray) -> float:
