@@ -138,9 +138,15 @@ def test_settings_count():
     assert helps["model-exploited"].startswith("five models instead of one (ensemble.members)")
 
 
+def test_one_bad_fit_is_not_yet_blind():
+    assert "models-blind" not in codes(changed(12, error_1=1.4))
+    assert "models-blind" in codes(changed(11, error_1=1.4))
+
+
 def test_an_exploited_run_says_where_its_models_fail():
     def meaning(**columns):
-        return next(c.meaning for c in examine([r | columns for r in exploiting()], CONFIG) if "exploited" in c.code)
+        rows = [r | (columns if r["iteration"] == 12 else {"error_1": 5.0, "outside": 0.2}) for r in exploiting()]
+        return next(c.meaning for c in examine(rows, CONFIG) if "exploited" in c.code)
 
     assert meaning(outside=0.64, error_5=0.9, error_T=0.99).endswith(
         "errors (64% of the imagined states lie outside the data)"
