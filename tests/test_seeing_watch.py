@@ -236,6 +236,7 @@ def test_plot_draws_what_is_asked_for(tmp_path, monkeypatch):
     for x, y in (("real_steps", "return_real"), ("wall_seconds", "kl"), ("iteration", "gap")):
         assert main(["plot", "runs", "--x", x, "--y", y]) == 0
     labels = [(f.axes[0].get_xlabel(), f.axes[0].get_ylabel()) for f in drawn]
+    assert all(tick == int(tick) for tick in drawn[2].axes[0].get_xticks()), "no half iterations"
     assert labels == [
         ("real steps", "real return"),
         ("wall-clock time (s)", "kl"),
@@ -264,7 +265,7 @@ def test_plot_draws_diagnostics_against_the_steps_of_their_iterations(tmp_path, 
     assert list(line.get_xdata()) == [9000, 12000, 15000]
     assert line.get_ydata() == pytest.approx([1e3, 1e4, 1e5])
     assert (error.get_yscale(), share.get_yscale(), overall.get_yscale()) == ("log", "linear", "log")
-    assert overall.get_ylabel() == "model error after an imagined episode (1: as predicting no change)"
+    assert overall.get_ylabel() == "model error after an imagined episode\n(1: as predicting no change)"
     assert {axes.yaxis.get_major_formatter()(0.2, 0) for axes in (error, overall)} == {"0.2"}
 
 

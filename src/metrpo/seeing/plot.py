@@ -31,11 +31,11 @@ _NAMES = {
     "return_collected": "collected return",
     "gap": "gap: imagined minus real return",
     "fraction_improved": "share of the models that improved",
-    "error_1": "model error after 1 step (1: as predicting no change)",
-    "error_T": "model error after an imagined episode (1: as predicting no change)",
-    "disagreement_real": "disagreement of the models on real states (std)",
-    "disagreement_imagined": "disagreement of the models in imagination (std)",
-    "outside": "share of the imagined states outside the data",
+    "error_1": "model error after 1 step\n(1: as predicting no change)",
+    "error_T": "model error after an imagined episode\n(1: as predicting no change)",
+    "disagreement_real": "disagreement on real states (std)",
+    "disagreement_imagined": "disagreement on imagined states (std)",
+    "outside": "imagined states outside the data",
 }
 
 
@@ -52,7 +52,7 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
     _require_column(runs, "x", x)
     import matplotlib
     from matplotlib.figure import Figure  # slow to import
-    from matplotlib.ticker import EngFormatter
+    from matplotlib.ticker import EngFormatter, MaxNLocator
 
     groups = [g for g in group(runs) if curve(g, x, y).seeds]
     if not groups:
@@ -80,6 +80,8 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        if x == "iteration":
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
         if y.startswith(RATIOS) and all((seed[1] > 0).all() for g in groups for seed in curve(g, x, y).seeds):
             _logarithmic(axes)
         ends = [seed[0][-1] for g in groups if g.task == task for seed in curve(g, x, y).seeds]
