@@ -89,7 +89,8 @@ class Browser:
         ask("Emulation.setEmulatedMedia", features=[scheme])
         ask("Page.navigate", url=page.resolve().as_uri())
         self._wait_for("Page.loadEventFired")
-        found = ask("Runtime.evaluate", expression=_MEASURE, returnByValue=True)["result"]["value"]
+        measured = ask("Runtime.evaluate", expression=_MEASURE, returnByValue=True, awaitPromise=True)
+        found = measured["result"]["value"]
         tall = height or min(found["height"], 16_000)
         clip = {"x": 0, "y": scroll, "width": width, "height": tall, "scale": 1}
         shot = ask("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)["data"]
@@ -155,8 +156,13 @@ def _complaint(event: dict[str, Any]) -> str:
 
 
 _MEASURE = """
-(() => {
+(async () => {
   document.querySelectorAll("details").forEach(d => d.open = true);
+  const shown = v => new Promise(r => v.readyState > 1 ? r() : v.addEventListener("loadeddata", r));
+  const soon = new Promise(r => setTimeout(r, 3000));
+  const videos = [...document.querySelectorAll("video")];
+  await Promise.race([Promise.all(videos.map(shown)), soon]);
+  if (videos.length) await new Promise(r => setTimeout(r, 500));  // until the controls have noticed
   const root = document.documentElement, wide = [], overlapping = [];
   for (const e of document.querySelectorAll("body *"))
     if (!e.closest(".scroll") && e.getBoundingClientRect().right > root.clientWidth + 1)

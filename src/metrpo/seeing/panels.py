@@ -210,7 +210,7 @@ def _video(s: Seen, folder: Path, left: Budget) -> str:
     left.left -= size
     return (
         f'<figure class="video"><figcaption><b>Video</b> <small>the policy at work</small></figcaption>'
-        f'<video controls muted loop playsinline preload="metadata" src="data:video/mp4;base64,{content}"></video>'
+        f'<video controls muted loop playsinline preload="auto" src="data:video/mp4;base64,{content}"></video>'
         "</figure>"
     )
 
