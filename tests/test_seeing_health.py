@@ -203,6 +203,16 @@ def test_committed_runs_with_one_model_are_named(committed):
     assert "return-fell" in [c.code for c in committed["laptop/HalfCheetah/k-1/seed-0"]]
 
 
+def test_committed_diagnostics_tell_five_models_from_one(committed):
+    runs = {r.path.parent.name: r for r in find([RESULTS / "diagnostics"]).runs}
+    assert set(runs) == {"me-trpo", "k-1"}
+    assert all(len(r.details) == len(r.rows) == 8 for r in runs.values())
+    (one,) = [c for c in committed["diagnostics/HalfCheetah/k-1/seed-0"] if c.code == "model-exploited"]
+    assert one.measured == "Imagined return 3.9 times the real one (mean of 3 iterations)"
+    assert "54% of the imagined states lie outside the data" in one.meaning
+    assert not [c for c in committed["diagnostics/HalfCheetah/me-trpo/seed-0"] if c.level == "warning"]
+
+
 def test_the_page_has_a_row_for_each():
     page = (RESULTS.parent / "docs" / "report.md").read_text()
     assert all(f"| `{code}` |" in page for code, *_ in CASES)

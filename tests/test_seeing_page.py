@@ -372,6 +372,8 @@ def test_a_chart_puts_points_where_they_belong():
     assert heights[2] == pytest.approx(3 * heights[0], abs=0.15), "three seconds are three times one"
     assert len(heights) == 3, "nothing is drawn for nothing"
     assert real_frame(np.array([0.0, 10.0]), np.array([5000.0, 9.0]))[1] == 25.0
+    assert real_frame(np.array([0.0, 10.0]), np.array([5000.0, 40.0, 45.0, 50.0, 9.0]))[1] == 50.0, "it lasts"
+    assert real_frame(np.array([0.0, 10.0]), np.array([5000.0, 4000.0, 3000.0, 2000.0]))[1] == 70.0
     assert [number(v) for v in (0.01234, 3.0, 1735.2, 2.5e6, math.nan)] == ["0.0123", "3", "1,735", "2.5M", "-"]
 
 

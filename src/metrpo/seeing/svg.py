@@ -107,7 +107,10 @@ def real_frame(real: np.ndarray, others: np.ndarray) -> tuple[float, float] | No
         return None
     low, high = float(real.min()), float(real.max())
     span = max(high - low, 0.1 * abs(high), 1e-9)
-    return max(min(low, float(others.min())), low - span), min(max(high, float(others.max())), high + 1.5 * span)
+    # A promise that lasts is what there is to see.
+    lasting = min(float(np.quantile(others, 0.75, method="lower")), high + 6 * span)
+    most = max(high + 1.5 * span, lasting)
+    return max(min(low, float(others.min())), low - span), min(max(high, float(others.max())), most)
 
 
 def number(value: float) -> str:
@@ -206,7 +209,7 @@ def _dot(line: Line, place: _Place, x: float, y: float, say_beyond: bool) -> str
     up = y > place.ys[1]
     edge, tip = (place.top, -6) if up else (place.bottom, 6)
     side = "end" if at > (place.left + place.right) / 2 else ""
-    text = f'<text class="{side}" x="{at + (-7 if side else 7):.1f}" y="{edge + (4 if up else -2)}">{number(y)}</text>'
+    text = f'<text class="{side}" x="{at + (-7 if side else 7):.1f}" y="{edge + (13 if up else -6)}">{number(y)}</text>'
     return (
         f'<polygon class="{line.style} fill" points="{at - 4:.1f},{edge} {at + 4:.1f},{edge} {at:.1f},{edge + tip}">'
         f"{value}</polygon>{text * say_beyond}"
