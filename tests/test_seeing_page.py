@@ -367,6 +367,10 @@ def test_a_chart_puts_points_where_they_belong():
     beyond = chart("t", [Line(x, np.array([1.0, 500.0, 2.0]), "a", "c0")], "x", "", frame=(0, 10))
     assert ">500<" in beyond
     assert len(numbers_in(beyond, "cx")) == 2
+    many = chart(
+        "t", [Line(np.arange(9.0), np.array([500.0] * 2 + [1.0] * 6 + [700.0]), "a", "c0")], "", "", frame=(0, 9)
+    )
+    assert (many.count(">500<"), many.count(">700<")) == (1, 1), "values of neighbours do not lie on each other"
     stacked = bars("t", ["a", "b"], np.array([[1.0, 2.0], [3.0, 0.0]]), [1, 2], "x", "")
     heights = numbers_in(stacked, "height")
     assert heights[2] == pytest.approx(3 * heights[0], abs=0.15), "three seconds are three times one"

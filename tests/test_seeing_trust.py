@@ -42,6 +42,7 @@ def test_every_diagnostic_has_a_chart_and_says_how_to_read_it(tmp_path):
     assert "the policy has gone where the models guess" in found
     assert "a model that the others outvote" in found
     assert "no real step has been so far out" in found
+    assert "Model error, one step" not in found, "one run is not drawn twice"
 
 
 def test_a_run_from_before_them_has_none_of_these_charts(tmp_path):
