@@ -38,6 +38,12 @@ def healthy(count=12):
                 "kl": 0.008,
                 "mean_std": 0.6,
                 "diverged": 0.0,
+                "error_1": 0.05 + 0.3 * 0.7**i,
+                "error_5": 0.08 + 0.4 * 0.7**i,
+                "error_T": 0.4 + 1.0 * 0.7**i,
+                "disagreement_real": 0.03,
+                "disagreement_imagined": 0.04 + 0.5 * 0.5**i,
+                "outside": 0.1 + 0.5 * 0.5**i,
                 "end_share": 0.02,
                 "end_recall": 0.9,
                 "end_false_alarms": 0.001,
@@ -78,6 +84,7 @@ CASES = [
     ("no-improvement", changed(1, return_real=5.0, gap=0.0), CONFIG, 1, "No return above the first one, 5, in 12"),
     ("few-evaluation-episodes", changed(1, return_real_std=900.0), CONFIG, 1, "Standard error of the return 201"),
     ("member-apart", changed(7, validation_loss_3=9.0), CONFIG, 7, "Validation loss of model 3 is 9"),
+    ("models-blind", changed(8, error_1=1.4), CONFIG, 8, "Model error 1.4 times that of predicting no change"),
     (
         "validation-loss-rising",
         changed(8, **{f"validation_loss_{k}": 20.0 for k in range(5)}),
@@ -131,6 +138,28 @@ def test_settings_count():
     assert helps["model-exploited"].startswith("five models instead of one (ensemble.members)")
 
 
+def test_one_bad_fit_is_not_yet_blind():
+    assert "models-blind" not in codes(changed(12, error_1=1.4))
+    assert "models-blind" in codes(changed(11, error_1=1.4))
+
+
+def test_an_exploited_run_says_where_its_models_fail():
+    def meaning(**columns):
+        rows = [r | (columns if r["iteration"] == 12 else {"error_1": 5.0, "outside": 0.2}) for r in exploiting()]
+        return next(c.meaning for c in examine(rows, CONFIG) if "exploited" in c.code)
+
+    assert meaning(outside=0.64, error_5=0.9, error_T=0.99).endswith(
+        "errors (64% of the imagined states lie outside the data)"
+    )
+    assert meaning(outside=0.0, error_5=1.2, error_T=NAN).endswith(
+        "errors (after 5 steps predictions are worse than no change)"
+    )
+    assert meaning(outside=1.0, error_T=3.0).endswith(
+        "states lie outside the data, and after an imagined episode predictions are worse than no change)"
+    )
+    assert meaning(outside=NAN, error_5=NAN, error_T=NAN).endswith("the policy exploits the models' errors")
+
+
 def test_negative_returns_and_returns_through_zero():
     rows = [r | {"return_real": r["return_real"] - 300, "return_imagined": 0.0} for r in healthy()]
     rows = [r | {"gap": -r["return_real"]} for r in rows]
@@ -172,6 +201,16 @@ def test_committed_runs_with_one_model_are_named(committed):
         warnings = {c.code for c in committed[f"laptop/HalfCheetah/k-1/seed-{seed}"] if c.level == "warning"}
         assert {"model-exploited", "validation-never-stops"} <= warnings
     assert "return-fell" in [c.code for c in committed["laptop/HalfCheetah/k-1/seed-0"]]
+
+
+def test_committed_diagnostics_tell_five_models_from_one(committed):
+    runs = {r.path.parent.name: r for r in find([RESULTS / "diagnostics"]).runs}
+    assert set(runs) == {"me-trpo", "k-1"}
+    assert all(len(r.details) == len(r.rows) == 8 for r in runs.values())
+    (one,) = [c for c in committed["diagnostics/HalfCheetah/k-1/seed-0"] if c.code == "model-exploited"]
+    assert one.measured == "Imagined return 3.9 times the real one (mean of 3 iterations)"
+    assert "54% of the imagined states lie outside the data" in one.meaning
+    assert not [c for c in committed["diagnostics/HalfCheetah/me-trpo/seed-0"] if c.level == "warning"]
 
 
 def test_the_page_has_a_row_for_each():

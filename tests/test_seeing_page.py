@@ -30,12 +30,26 @@ VOID = {"meta", "br", "img"}
 LOADING = {"src", "srcset", "poster", "data", "action", "background", "xlink:href", "formaction", "ping", "cite"}
 
 
-def a_run(folder, config=CONFIG, rows=None):
+def details(count=12, dimensions=4):
+    """diagnostics.csv of the healthy run; after a whole episode, dimension 2 is worse than no change, and model 3 never
+    agrees."""
+    worse = lambda k, d: 1.7 if (k, d) == ("T", 2) else 0.1 * (d + 1)  # noqa: E731
+    return [
+        {"iteration": i, "real_steps": 3000 * i}
+        | {f"error_{k}_{d}": worse(k, d) for k in ("1", "5", "T") for d in range(dimensions)}
+        | {f"improved_{k}": 0.0 if k == 3 else 0.8 for k in range(5)}
+        for i in range(1, count + 1)
+    ]
+
+
+def a_run(folder, config=CONFIG, rows=None, diagnostics=None):
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(to_json(config))
     rows = healthy() if rows is None else rows
     if rows:
         (folder / "metrics.csv").write_text(to_csv(rows))
+    if diagnostics:
+        (folder / "diagnostics.csv").write_text(to_csv(diagnostics))
     return folder
 
 
@@ -156,6 +170,7 @@ def test_what_a_run_says_is_text_and_no_markup(tmp_path):
     a_run(tmp_path / "other", dataclasses.replace(evil, seed=1, system="k-1", preset="paper"), rows)
     (tmp_path / "<i>damaged").mkdir()
     (tmp_path / "<i>damaged" / "metrics.csv").write_text("<u>")
+    (tmp_path / "other" / "diagnostics.csv").write_text('iteration,real_steps,"error_1_0","<u>"\n1,3000,0.5,1\n')
     found = parsed([tmp_path], tmp_path)
     assert not {"script", "img", "b>", "i>", "u", "del", "ins"} & set(found.tags)
     assert found.references == []
@@ -306,8 +321,12 @@ def test_no_numbers_are_too_odd():
         for config in (CONFIG, ONE):
             assert all(concern.text for concern in examine(rows, config))
         if trial % 5 == 0:
-            found = Found([SeenRun(Path("a"), CONFIG, rows), SeenRun(Path("b"), ONE, rows)], [])
-            Page(page(found, Path()))
+            odd = [{n: draw.choice(values) if "_" in n else v for n, v in row.items()} for row in details()]
+            odd = [{**row, "real_steps": 3000 * row["iteration"]} for row in odd]
+            found = Found([SeenRun(Path("a"), CONFIG, rows, odd), SeenRun(Path("b"), ONE, rows)], [])
+            text = page(found, Path())
+            Page(text)
+            assert not re.search(r'="[^"<>a-z]*\b(nan|inf)\b', text), "no coordinate is nan"
             assert json.dumps(record(found))
             assert standing(found.runs[0]).iteration == len(rows)
 
@@ -348,11 +367,17 @@ def test_a_chart_puts_points_where_they_belong():
     beyond = chart("t", [Line(x, np.array([1.0, 500.0, 2.0]), "a", "c0")], "x", "", frame=(0, 10))
     assert ">500<" in beyond
     assert len(numbers_in(beyond, "cx")) == 2
+    many = chart(
+        "t", [Line(np.arange(9.0), np.array([500.0] * 2 + [1.0] * 6 + [700.0]), "a", "c0")], "", "", frame=(0, 9)
+    )
+    assert (many.count(">500<"), many.count(">700<")) == (1, 1), "values of neighbours do not lie on each other"
     stacked = bars("t", ["a", "b"], np.array([[1.0, 2.0], [3.0, 0.0]]), [1, 2], "x", "")
     heights = numbers_in(stacked, "height")
     assert heights[2] == pytest.approx(3 * heights[0], abs=0.15), "three seconds are three times one"
     assert len(heights) == 3, "nothing is drawn for nothing"
     assert real_frame(np.array([0.0, 10.0]), np.array([5000.0, 9.0]))[1] == 25.0
+    assert real_frame(np.array([0.0, 10.0]), np.array([5000.0, 40.0, 45.0, 50.0, 9.0]))[1] == 50.0, "it lasts"
+    assert real_frame(np.array([0.0, 10.0]), np.array([5000.0, 4000.0, 3000.0, 2000.0]))[1] == 70.0
     assert [number(v) for v in (0.01234, 3.0, 1735.2, 2.5e6, math.nan)] == ["0.0123", "3", "1,735", "2.5M", "-"]
 
 

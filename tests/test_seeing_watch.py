@@ -24,7 +24,7 @@ from metrpo.seeing.curves import curve
 from metrpo.seeing.runs import find, group, read
 from metrpo.seeing.watch import SPARKS, is_running, sparkline, standing, watch
 from test_seeing_health import healthy
-from test_seeing_page import a_run
+from test_seeing_page import a_run, details
 
 CONFIG = Config("Swimmer", iterations=20)
 TIMED = [r | {"wall_seconds": 2.0 * r["iteration"] ** 2} for r in healthy(10)]
@@ -236,6 +236,7 @@ def test_plot_draws_what_is_asked_for(tmp_path, monkeypatch):
     for x, y in (("real_steps", "return_real"), ("wall_seconds", "kl"), ("iteration", "gap")):
         assert main(["plot", "runs", "--x", x, "--y", y]) == 0
     labels = [(f.axes[0].get_xlabel(), f.axes[0].get_ylabel()) for f in drawn]
+    assert all(tick == int(tick) for tick in drawn[2].axes[0].get_xticks()), "no half iterations"
     assert labels == [
         ("real steps", "real return"),
         ("wall-clock time (s)", "kl"),
@@ -248,6 +249,24 @@ def test_plot_draws_what_is_asked_for(tmp_path, monkeypatch):
     mean = next(line for line in panels["Swimmer"].lines if line.get_label() == "me-trpo (3 seeds)")
     assert mean.get_ydata()[-1] == pytest.approx(2 * TIMED[-1]["return_real"]), "the mean of one, two and three times"
     assert len(panels["Swimmer"].collections) == 1, "one band"
+
+
+def test_plot_draws_diagnostics_against_the_steps_of_their_iterations(tmp_path, monkeypatch):
+    from matplotlib.figure import Figure
+
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: drawn.append(self))
+    rows = [r | {"error_10_3": 10.0 ** r["iteration"], "improved_0": 0.0} for r in details()]
+    a_run(tmp_path / "a", diagnostics=rows[2:5])  # the file may be a row behind, or begin late
+    for y in ("error_10_3", "improved_0", "error_T"):
+        assert main(["plot", "a", "--y", y]) == 0
+    error, share, overall = (figure.axes[0] for figure in drawn)
+    (line,) = error.lines
+    assert list(line.get_xdata()) == [9000, 12000, 15000]
+    assert line.get_ydata() == pytest.approx([1e3, 1e4, 1e5])
+    assert (error.get_yscale(), share.get_yscale(), overall.get_yscale()) == ("log", "linear", "log")
+    assert overall.get_ylabel() == "model error after an imagined episode\n(1: as predicting no change)"
+    assert {axes.yaxis.get_major_formatter()(0.2, 0) for axes in (error, overall)} == {"0.2"}
 
 
 @pytest.mark.parametrize(

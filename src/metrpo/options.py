@@ -376,7 +376,7 @@ class Plot:
     For example:
         metrpo plot runs/sweep
         metrpo plot runs/sweep --out sweep.pdf --x wall_seconds
-        metrpo plot runs --y gap --x iteration            # any column of metrics.csv
+        metrpo plot runs --y gap --x iteration            # any column of metrics.csv or diagnostics.csv
     """
 
     dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
@@ -386,7 +386,7 @@ class Plot:
     x: Literal["real_steps", "wall_seconds", "iteration"] = "real_steps"
     """What the curves are drawn against."""
     y: Annotated[str, arg(metavar="COLUMN")] = "return_real"
-    """Column of metrics.csv to draw."""
+    """Column of metrics.csv or diagnostics.csv to draw, such as gap, outside, error_T, error_10_3 or improved_0."""
 
     def __post_init__(self) -> None:
         _require_dirs(self.dirs)

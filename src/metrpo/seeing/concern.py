@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -52,6 +53,17 @@ def losses_of(rows: Sequence[Row]) -> np.ndarray:
     """Validation losses [iterations, members]."""
     names = [name for name in rows[0] if name.startswith("validation_loss_")]
     return np.array([column(rows, name) for name in names]).T.reshape(len(rows), len(names))
+
+
+def horizons(rows: Sequence[Row]) -> list[str]:
+    """The numbers of steps whose model errors were measured at all, least first: "1", "5", ..., "T"."""
+    names = [found[1] for name in (rows[0] if rows else ()) if (found := re.fullmatch(r"error_(\d+|T)", name))]
+    return [name for name in names if np.isfinite(column(rows, f"error_{name}")).any()]
+
+
+def after(steps: str) -> str:
+    """Such a number in words."""
+    return {"1": "1 step", "T": "an imagined episode"}.get(steps, f"{steps} steps")
 
 
 def standard_error(rows: Sequence[Row], config: Config) -> np.ndarray:

@@ -14,6 +14,8 @@ POINTS = 60
 """Of a mean curve."""
 FAR = 8
 """The longest run over the shortest one, beyond which real steps stand on a logarithmic axis."""
+RATIOS = ("error_", "disagreement_")
+"""Columns that begin so stand on a logarithmic axis; an error of 1 is that of predicting no change."""
 
 
 class Curve(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 
 from metrpo.config import Config
 from metrpo.run.metrics import Row
-from metrpo.seeing.concern import Concern, iteration_at, losses_of, short, since_when
+from metrpo.seeing.concern import Concern, after, horizons, iteration_at, losses_of, short, since_when
 from metrpo.seeing.runs import column
 
 EXPLOITED = 0.5
@@ -22,6 +22,8 @@ RISING = 5.0
 """Validation loss, median of the models, over the lowest so far."""
 DIVERGED = 0.01
 """Share of imagined rollouts that leave all bounds."""
+BLIND = 1.0
+"""Error of a prediction, in parts of that of predicting no change."""
 LOST_ENDS, FALSE_ENDS, MISCALIBRATED = 0.5, 0.01, 0.05
 """Learned end of an episode: share of ends seen (least), share of other steps taken for one, calibration error."""
 
@@ -52,8 +54,34 @@ def model_exploited(rows: Sequence[Row], config: Config) -> Concern | None:
         "note" if early else "warning",
         since,
         f"Imagined return {times} (mean of {AVERAGED} iterations)",
-        "the policy exploits the models' errors" + (", as most do while data are few" if early else ""),
+        "the policy exploits the models' errors" + (", as most do while data are few" if early else "") + _where(rows),
         f"{members} (ensemble.members), shorter imagined episodes (imagine.horizon) or more real steps help",
+    )
+
+
+def _where(rows: Sequence[Row]) -> str:
+    """What else was measured of the last models, as the end of a sentence; nothing of a run from before that."""
+    outside = column(rows, "outside")[-1]
+    said = [f"{outside:.0%} of the imagined states lie outside the data"] if outside > 0 else []
+    far = next((k for k in horizons(rows) if column(rows, f"error_{k}")[-1] > BLIND), None)
+    said += [f"after {after(far)} predictions are worse than no change"] if far is not None else []
+    return f" ({', and '.join(said)})" if said else ""
+
+
+def models_blind(rows: Sequence[Row], config: Config) -> Concern | None:
+    """Whoever predicts that nothing changes is nearer to the real next state than the models are."""
+    error = column(rows, "error_1")
+    since = since_when(rows, error > BLIND)
+    if since is None or since > iteration_at(rows, -2):
+        return None
+    return Concern(
+        "models-blind",
+        "warning",
+        since,
+        f"Model error {short(error[-1])} times that of predicting no change, after a single step on held-out episodes",
+        "the models know nothing of what an action does, so that the policy learns in a world of its own",
+        "a look at the data first (do state, action and next state belong together? are there outliers?), then longer "
+        "fitting (fit.max_passes, fit.patience) or a smaller fit.learning_rate",
     )
 
 

@@ -10,8 +10,9 @@ import numpy as np
 
 from metrpo.run.progress import duration
 from metrpo.seeing import svg
+from metrpo.seeing.figure import count
 from metrpo.seeing.health import examine
-from metrpo.seeing.panels import Budget, Seen, count, task_section
+from metrpo.seeing.panels import Budget, Seen, task_section
 from metrpo.seeing.runs import Found, Group, SeenRun, group, is_finished, settings
 from metrpo.seeing.style import STYLE
 from metrpo.seeing.svg import number

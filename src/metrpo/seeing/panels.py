@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -15,9 +14,11 @@ import numpy as np
 from metrpo.run.metrics import is_clock
 from metrpo.seeing import svg
 from metrpo.seeing.concern import Concern
-from metrpo.seeing.curves import FAR, curve, x_axis
+from metrpo.seeing.curves import FAR, RATIOS, curve, x_axis
+from metrpo.seeing.figure import count, figure, swatches
 from metrpo.seeing.runs import Group, SeenRun
 from metrpo.seeing.svg import Line, bars, chart
+from metrpo.seeing.trust import trust_of
 
 _QUANTITIES = (
     ("gap", "Gap", "imagined minus real return; near zero is good", True),
@@ -28,13 +29,28 @@ _QUANTITIES = (
     ("kl", "KL divergence", "mean over the updates", True),
     ("mean_std", "Standard deviation", "of the policy's actions", True),
     ("diverged", "Diverged rollouts", "share of the imagined ones", True),
+    ("error_1", "Model error, one step", "on held-out real steps; 1: no better than predicting no change", False),
+    ("error_T", "Model error, an episode", "the same after a whole imagined episode", False),
+    ("disagreement_imagined", "Disagreement", "of the models in imagination, in standard deviations", False),
+    ("outside", "Outside the data", "share of the imagined states beyond the real ones' range", True),
+    ("members_reset", "Models started anew", "in each iteration, having diverged", True),
     ("return_collected", "Collected return", "of the real episodes, with exploration noise", False),
     ("train_loss", "Training loss", "mean over the models", True),
     ("fit_passes", "Passes of fitting", "over the training set", True),
 )
 """Column, title, what it is, and whether its axis has the zero."""
-_OWN = ("iteration", "real_steps", "return_real", "return_real_std", "return_imagined", "validations")
+_OWN = (
+    "iteration",
+    "real_steps",
+    "return_real",
+    "return_real_std",
+    "return_imagined",
+    "validations",
+    "disagreement_real",
+)
 """Columns that are shown elsewhere."""
+_TRUST = (*RATIOS, "outside")
+"""Columns that begin so are drawn by `trust_of` for each run."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +78,14 @@ def task_section(task: str, seen: list[Seen], groups: list[Group], folder: Path,
     parts = [f"<section><h2>{escape(task)}</h2>", _learning(task, seen, groups, colours, x, x_label)]
     trust = [_trust(s, x, x_label) for s in seen]
     if any(trust):
-        inside = f'{_names([("real", "real"), ("imagined", "imagined")])}<div class="grid">{"".join(trust)}</div>'
+        inside = f'{swatches([("real", "real"), ("imagined", "imagined")])}<div class="grid">{"".join(trust)}</div>'
         folded = f"<details><summary>{count(len(seen), 'run')}</summary>{inside}</details>"
         parts.append(f"<h3>Real and imagined return</h3>{inside if len(seen) <= 12 else folded}")
     several = len(groups) > 1
     still = [title for name, title, *_ in _QUANTITIES if _is_zero(seen, name)]
-    small = [_across(seen, *q, x, x_label) for q in _QUANTITIES if q[1] not in still]
+    # What is shown of every run by itself is drawn once more to compare several.
+    drawn = [q for q in _QUANTITIES if q[1] not in still and (len(seen) > 1 or not q[0].startswith(_TRUST))]
+    small = [_across(seen, *q, x, x_label) for q in drawn]
     others = [_across(seen, name, name, "", False, x, x_label) for name in _others(seen)]
     if any(small):
         parts.append(f'<h3>All runs of {escape(task)}</h3>{_legend(groups, colours) * several}<div class="grid">')
@@ -119,8 +137,10 @@ def _across(seen: list[Seen], name: str, title: str, note: str, zero: bool, x: s
         return ""
     frame, ends = _robust([line.y for line in lines]) if name == "gap" else None, [line.x[-1] for line in lines]
     log = x == "real_steps" and max(ends) > FAR * min(ends)
-    drawn = chart(title, lines, x_label, "", frame=frame, zero=zero, log=log, say_beyond=len(lines) == 1)
-    return _figure(title, note, drawn)
+    log_y, mark = name.startswith(RATIOS), 1.0 if name.startswith("error_") else None
+    alone = len(lines) == 1
+    drawn = chart(title, lines, x_label, "", frame=frame, zero=zero, log=log, say_beyond=alone, log_y=log_y, mark=mark)
+    return figure(title, note, drawn)
 
 
 def _is_zero(seen: list[Seen], name: str) -> bool:
@@ -137,12 +157,12 @@ def _trust(s: Seen, x: str, x_label: str) -> str:
     lines = [line for line in lines if np.isfinite(line.y).any()]
     drawn = chart(f"Real and imagined return of {s.name}", lines, x_label, "", frame=svg.real_frame(real, imagined))
     horizon = s.run.config.imagine.horizon
-    return _figure(s.name, f"imagined: {horizon} steps only, not to be compared" if horizon else "", drawn)
+    return figure(s.name, f"imagined: {horizon} steps only, not to be compared" if horizon else "", drawn)
 
 
 def _of_run(s: Seen, x: str, x_label: str) -> str:
     run, at = s.run, s.run.column(x)
-    parts: list[str] = []
+    parts = [trust_of(run, x, x_label)]
     losses = [name for name in run.rows[0] if name.startswith("validation_loss_")]
     if losses:
         styles = [f"c{k % svg.COLOURS}{' dashed' * (k // svg.COLOURS % 2)}" for k in range(len(losses))]
@@ -152,14 +172,14 @@ def _of_run(s: Seen, x: str, x_label: str) -> str:
         ]
         drawn = chart("Validation loss", lines, x_label, "", zero=True)
         legend = [(style, line.name) for style, line in zip(styles, lines, strict=True)]
-        parts.append(_figure("Validation loss", "of each model, on held-out real steps", drawn, legend))
+        parts.append(figure("Validation loss", "of each model, on held-out real steps", drawn, legend))
     if np.isfinite(run.column("updates")).any():
         tried, kept, rejected = (run.column(n) for n in ("updates", "accepted_updates", "rejected_steps"))
         given = (("tried", tried, "c2"), ("accepted", kept, "c0"), ("rejected", rejected, "c3"))
         lines = [Line(at, y, name, style, dots=False) for name, y, style in given if np.isfinite(y).any()]
         drawn = chart("Policy updates", lines, x_label, "", zero=True)
         legend = [(line.style, line.name) for line in lines]
-        parts.append(_figure("Policy updates", "tried, accepted by validation, rejected unmoved", drawn, legend))
+        parts.append(figure("Policy updates", "tried, accepted by validation, rejected unmoved", drawn, legend))
     stages = [name for name in run.rows[0] if name.startswith("seconds_") and np.nansum(run.column(name)) > 0]
     if stages:
         names = [name.removeprefix("seconds_") for name in stages]
@@ -167,26 +187,14 @@ def _of_run(s: Seen, x: str, x_label: str) -> str:
         iterations = [int(row["iteration"] or 0) for row in run.rows]
         drawn = bars("Stage times", names, seconds, iterations, "iteration", "")
         legend = [(f"c{i % svg.COLOURS}", name) for i, name in enumerate(names)]
-        parts.append(_figure("Stage times", "seconds of every iteration", drawn, legend))
+        parts.append(figure("Stage times", "seconds of every iteration", drawn, legend))
     return "".join(parts)
 
 
-def _figure(title: str, note: str, drawn: str, legend: Sequence[tuple[str, str]] = ()) -> str:
-    said = f" <small>{escape(note)}</small>" if note else ""
-    return f"<figure><figcaption><b>{escape(title)}</b>{said}</figcaption>{drawn}{_names(legend)}</figure>"
-
-
 def _legend(groups: list[Group], colours: dict[int, str]) -> str:
-    return _names(
+    return swatches(
         [(colours[id(g)], f"{g.label} ({count(len(g.runs), 'seed')})" if len(g.runs) > 1 else g.label) for g in groups]
     )
-
-
-def _names(names: Sequence[tuple[str, str]]) -> str:
-    if not names:
-        return ""
-    items = "".join(f'<li><i class="swatch {style}"></i>{escape(name)}</li>' for style, name in names)
-    return f'<ul class="legend">{items}</ul>'
 
 
 def _video(s: Seen, folder: Path, left: Budget) -> str:
@@ -202,7 +210,7 @@ def _video(s: Seen, folder: Path, left: Budget) -> str:
     left.left -= size
     return (
         f'<figure class="video"><figcaption><b>Video</b> <small>the policy at work</small></figcaption>'
-        f'<video controls muted loop playsinline preload="metadata" src="data:video/mp4;base64,{content}"></video>'
+        f'<video controls muted loop playsinline preload="auto" src="data:video/mp4;base64,{content}"></video>'
         "</figure>"
     )
 
@@ -211,7 +219,8 @@ def _others(seen: list[Seen]) -> list[str]:
     """Columns that no chart is made for: what later versions measure is shown too."""
     known = {*_OWN, *(q[0] for q in _QUANTITIES)}
     names = dict.fromkeys(name for s in seen for name in s.run.rows[0])
-    return [n for n in names if n not in known and not is_clock(n) and not n.startswith("validation_loss_")]
+    shown = ("validation_loss_", *_TRUST)
+    return [n for n in names if n not in known and not is_clock(n) and not n.startswith(shown)]
 
 
 def _robust(values: list[np.ndarray]) -> tuple[float, float]:
@@ -220,8 +229,3 @@ def _robust(values: list[np.ndarray]) -> tuple[float, float]:
     low, high = (float(q) for q in np.quantile(finite, [0.0, 0.9]))
     high = float(finite.max()) if finite.max() <= 3 * max(high, -low, 1e-9) else 2 * max(high, 0.0)
     return min(low, 0.0), max(high, 0.0) if high > 0 or low < 0 else 1.0
-
-
-def count(n: int, what: str) -> str:
-    """So many of something, in words."""
-    return f"{n} {what}{'' if n == 1 else 's'}"

@@ -5,14 +5,17 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from metrpo.errors import ConfigError
 from metrpo.run.files import atomic_write
-from metrpo.seeing.curves import FAR, curve
+from metrpo.seeing.curves import FAR, RATIOS, curve
 from metrpo.seeing.runs import SeenRun, group
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 X = Literal["real_steps", "wall_seconds", "iteration"]
 FORMATS = ("png", "svg", "pdf")
@@ -28,14 +31,19 @@ _NAMES = {
     "return_collected": "collected return",
     "gap": "gap: imagined minus real return",
     "fraction_improved": "share of the models that improved",
+    "error_1": "model error after 1 step\n(1: as predicting no change)",
+    "error_T": "model error after an imagined episode\n(1: as predicting no change)",
+    "disagreement_real": "disagreement on real states (std)",
+    "disagreement_imagined": "disagreement on imagined states (std)",
+    "outside": "imagined states outside the data",
 }
 
 
 def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "return_real") -> Path:
     """Draws the column `y` against `x` to `path` (.png, .svg or .pdf), atomically, and returns it.
 
-    Raises `ConfigError` when the file has another ending or no run has both columns, `RunDirectoryError` when it cannot
-    be written.
+    `y` is one of metrics.csv or of diagnostics.csv. Raises `ConfigError` when the file has another ending or no run has
+    both columns, `RunDirectoryError` when it cannot be written.
     """
     kind = path.suffix.removeprefix(".").lower()
     if kind not in FORMATS:
@@ -44,7 +52,7 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
     _require_column(runs, "x", x)
     import matplotlib
     from matplotlib.figure import Figure  # slow to import
-    from matplotlib.ticker import EngFormatter
+    from matplotlib.ticker import EngFormatter, MaxNLocator
 
     groups = [g for g in group(runs) if curve(g, x, y).seeds]
     if not groups:
@@ -72,6 +80,10 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        if x == "iteration":
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        if y.startswith(RATIOS) and all((seed[1] > 0).all() for g in groups for seed in curve(g, x, y).seeds):
+            _logarithmic(axes)
         ends = [seed[0][-1] for g in groups if g.task == task for seed in curve(g, x, y).seeds]
         if x == "real_steps" and min(ends) > 0 and max(ends) > FAR * min(ends):
             axes.set_xscale("log")
@@ -92,11 +104,22 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
     return path
 
 
+def _logarithmic(axes: Axes) -> None:
+    """Makes y logarithmic, with plain numbers at 1, 2 and 5."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
 def _require_column(runs: Sequence[SeenRun], option: str, name: str) -> None:
     columns = dict.fromkeys(n for run in runs for n in (run.rows[0] if run.rows else ()))
     if not any(np.isfinite(run.column(name)).any() for run in runs):
         have = [n for n in columns if any(np.isfinite(run.column(n)).any() for run in runs)]
+        more = ", or one of diagnostics.csv" if any(run.details for run in runs) else ""
         said = "an empty one (deterministic runs keep no clock)" if name in columns else repr(name)
         raise ConfigError(
-            f"{option}: expected a column with numbers ({', '.join(have) or 'there is none'}), got {said}"
+            f"{option}: expected a column with numbers ({', '.join(have) or 'there is none'}{more}), got {said}"
         )

@@ -6,7 +6,7 @@ import csv
 import math
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,10 +28,15 @@ class SeenRun:
     config: Config
     rows: list[Row]
     """Its finished iterations; none while it is in its first."""
+    details: list[Row] = field(default_factory=list)
+    """Of diagnostics.csv, each with its iteration; none of a run from before it was written."""
 
     def column(self, name: str) -> np.ndarray:
-        """One number an iteration; NaN where there is none."""
-        return column(self.rows, name)
+        """One number an iteration, of metrics.csv or else of diagnostics.csv; NaN where there is none."""
+        if not self.details or any(name in row for row in self.rows):
+            return column(self.rows, name)
+        by_iteration = {row["iteration"]: row for row in self.details}
+        return column([by_iteration.get(row["iteration"], {}) for row in self.rows], name)
 
 
 class Skipped(NamedTuple):
@@ -60,10 +65,13 @@ def find(paths: Sequence[Path]) -> Found:
             raise RunDirectoryError(f"{path}: expected a run directory or a folder with runs inside, got {what}")
     runs, skipped = list[SeenRun](), list[Skipped]()
     for folder in {folder.resolve(): folder for path in paths for folder in _folders(path)}.values():
+        file = folder
         try:
             runs.append(read(folder))
+            file = folder / "diagnostics.csv"  # without which the run is whole
+            runs[-1] = replace(runs[-1], details=_details(file))
         except RunDirectoryError as error:
-            skipped.append(Skipped(folder, str(error)))
+            skipped.append(Skipped(file, str(error)))
     if not runs:
         where = ", ".join(map(str, paths))
         if skipped:
@@ -85,12 +93,25 @@ def read(folder: Path) -> SeenRun:
     try:
         _require_whole(metrics)
         rows = read_metrics(metrics)
-        _require_sense(rows)
+        _require_sense(rows, ("iteration", "real_steps", "return_real"))
     except FileNotFoundError:
         rows = []  # in its first iteration
     except (OSError, ValueError, TypeError, csv.Error) as error:
         raise RunDirectoryError(f"{metrics} cannot be read: {error}; put it back or leave the run out") from None
     return SeenRun(folder, config, rows)
+
+
+def _details(file: Path) -> list[Row]:
+    """The rows of a diagnostics.csv, none where there is no such file. Raises `RunDirectoryError` for a damaged one."""
+    try:
+        _require_whole(file)
+        rows = read_metrics(file)
+        _require_sense(rows, ("iteration", "real_steps"))
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, TypeError, csv.Error) as error:
+        raise RunDirectoryError(f"{file} cannot be read: {error}; its charts are left out") from None
+    return rows
 
 
 def column(rows: Iterable[Row], name: str) -> np.ndarray:
@@ -176,12 +197,12 @@ def _require_whole(metrics: Path) -> None:
         raise ValueError("it was cut within a row")
 
 
-def _require_sense(rows: list[Row]) -> None:
+def _require_sense(rows: list[Row], needed: Sequence[str]) -> None:
     """Raises `ValueError` for what no run writes: the file was cut or edited."""
     if not rows:
         raise ValueError("expected a row for each iteration, got none")
     columns = list(rows[0])
-    if missing := [name for name in ("iteration", "real_steps", "return_real") if name not in columns]:
+    if missing := [name for name in needed if name not in columns]:
         raise ValueError(f"expected the column {missing[0]}, got {', '.join(map(str, columns))[:80]}")
     for number, row in enumerate(rows, 1):
         if None in row or not isinstance(row["iteration"], int) or not isinstance(row["real_steps"], int):

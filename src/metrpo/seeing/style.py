@@ -36,7 +36,7 @@ figcaption{padding:0 .2rem .3rem;line-height:1.3}
 details{margin:.8rem 0}summary{cursor:pointer;font-weight:600;padding:.3rem 0;overflow-wrap:anywhere}
 .legend{list-style:none;display:flex;flex-wrap:wrap;gap:.1rem 1.1rem;margin:.3rem 0 .5rem;padding:0 .2rem;
 font-size:.86rem}
-figure .legend{margin:.2rem 0 0}
+figure .legend,figure .small{margin:.2rem 0 0}figure .small{padding:0 .2rem}
 .swatch{display:inline-block;width:.85em;height:.85em;border-radius:.2em;margin-right:.45em;background:currentColor;
 vertical-align:-.05em}
 .swatch.dashed{opacity:.55}
@@ -44,7 +44,7 @@ vertical-align:-.05em}
 .narrow{display:none}
 svg{display:block;width:100%;height:auto;overflow:visible}
 svg text{fill:var(--soft);font:11px system-ui,-apple-system,"Segoe UI",sans-serif}
-svg .end{text-anchor:end}svg .mid{text-anchor:middle}
+svg .in{fill:var(--ink)}svg .end{text-anchor:end}svg .mid{text-anchor:middle}
 line.grid{stroke:var(--grid)}line.axis,line.zero{stroke:var(--soft)}
 polyline{fill:none;stroke:currentColor;stroke-width:1.6;stroke-linejoin:round}
 polyline.thick{stroke-width:2.4}polyline.thin{stroke-width:1;opacity:.45}polyline.dashed{stroke-dasharray:5 3}

@@ -8,13 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 
 import numpy as np
 
 COLOURS = 6
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 10, 10, 34
+_APART = 80
+"""Between two values that are written beside arrows, at least."""
+_FAR = 1e-6, 1e9
+"""Ends of every logarithmic axis of y; what lies beyond is an arrow."""
 
 
 @dataclass(frozen=True)
@@ -42,20 +46,27 @@ def chart(
     zero: bool = False,
     log: bool = False,
     say_beyond: bool = True,
+    log_y: bool = False,
+    mark: float | None = None,
 ) -> str:
     """A line chart.
 
     `frame` are the limits of the y axis; points beyond them are drawn as arrows at the edge, with their value beside
     them if `say_beyond`. `zero`: the axis has it, and the line y = 0 is drawn. `log`: x is logarithmic, and above zero.
+    `log_y`: so is y, without a frame; what is not above zero is a gap. `mark`: the line y = mark is drawn.
     """
+    if log_y:
+        lines = [replace(line, y=np.where(line.y > 0, line.y, np.nan)) for line in lines]
     x0, x1 = _span([line.x for line in lines], floor=None if log else 0.0)
     ys = [v for line in lines for v in (line.y, line.low, line.high) if v is not None]
+    ys += [] if mark is None else [np.array([mark])]
     y0, y1 = _span(ys if frame is None else [np.array(frame)])
     if zero and frame is None:
         y0, y1 = min(y0, 0.0), max(y1, 0.0)
     pad = 0.05 * (y1 - y0)
-    place = _Place(size, (x0, x1), (y0 - pad * (y0 != 0), y1 + pad), log)
-    parts = [_axes(place, x_label, y_label, zero)]
+    limits = (np.clip(y0, *_FAR) / 1.2, np.clip(y1, *_FAR) * 1.2) if log_y else (y0 - pad * (y0 != 0), y1 + pad)
+    place = _Place(size, (x0, x1), limits, log, log_y)
+    parts = [_axes(place, x_label, y_label, 0.0 if zero else mark)]
     parts += [_band(line, place) for line in lines]
     parts += [_line(line, place, say_beyond) for line in lines]
     width, height = size
@@ -72,7 +83,7 @@ def bars(title: str, names: Sequence[str], columns: np.ndarray, x: Sequence[int]
     top = float(stack[-1].max()) if stack.size else 1.0
     place = _Place(size, (min(x) - 0.5, max(x) + 0.5), (0.0, 1.05 * top or 1.0))
     width = 0.8 * (place.x(1.0) - place.x(0.0))
-    parts = [_axes(place, x_label, y_label, False)]
+    parts = [_axes(place, x_label, y_label, None)]
     for i, name in enumerate(names):
         below = stack[i - 1] if i else np.zeros(len(x))
         for at, low, high in zip(x, below, stack[i], strict=True):
@@ -96,7 +107,10 @@ def real_frame(real: np.ndarray, others: np.ndarray) -> tuple[float, float] | No
         return None
     low, high = float(real.min()), float(real.max())
     span = max(high - low, 0.1 * abs(high), 1e-9)
-    return max(min(low, float(others.min())), low - span), min(max(high, float(others.max())), high + 1.5 * span)
+    # A promise that lasts is what there is to see.
+    lasting = min(float(np.quantile(others, 0.75, method="lower")), high + 6 * span)
+    most = max(high + 1.5 * span, lasting)
+    return max(min(low, float(others.min())), low - span), min(max(high, float(others.max())), most)
 
 
 def number(value: float) -> str:
@@ -113,27 +127,36 @@ class _Place:
     """Where a value lies in the picture."""
 
     def __init__(
-        self, size: tuple[int, int], x: tuple[float, float], y: tuple[float, float], log: bool = False
+        self,
+        size: tuple[int, int],
+        x: tuple[float, float],
+        y: tuple[float, float],
+        log: bool = False,
+        log_y: bool = False,
     ) -> None:
-        self.size, self.xs, self.ys, self.log = size, x, y, log
+        self.size, self.xs, self.ys, self.log, self.log_y = size, x, y, log, log_y
         self.left, self.right, self.top, self.bottom = _LEFT, size[0] - _RIGHT, _TOP, size[1] - _BOTTOM
 
     def x(self, value: float) -> float:
-        at, low, high = (math.log(v) if self.log else v for v in (value, *self.xs))
-        return self.left + (at - low) / (high - low) * (self.right - self.left)
+        return self.left + _part(value, self.xs, self.log) * (self.right - self.left)
 
     def y(self, value: float) -> float:
-        return self.bottom - (value - self.ys[0]) / (self.ys[1] - self.ys[0]) * (self.bottom - self.top)
+        return self.bottom - _part(value, self.ys, self.log_y) * (self.bottom - self.top)
 
     def point(self, x: float, y: float) -> str:
         return f"{self.x(x):.1f},{min(max(self.y(y), self.top), self.bottom):.1f}"
 
 
-def _axes(place: _Place, x_label: str, y_label: str, zero: bool) -> str:
+def _part(value: float, limits: tuple[float, float], log: bool) -> float:
+    at, low, high = (math.log(v) if log else v for v in (value, *limits))
+    return (at - low) / (high - low)
+
+
+def _axes(place: _Place, x_label: str, y_label: str, mark: float | None) -> str:
     parts = []
-    for value, text in _ticks(*place.ys, 5):
+    for value, text in _decades(*place.ys) if place.log_y else _ticks(*place.ys, 5):
         y = f"{place.y(value):.1f}"
-        style = "zero" if zero and value == 0 else "grid"
+        style = "zero" if value == mark else "grid"
         parts.append(f'<line class="{style}" x1="{place.left}" x2="{place.right}" y1="{y}" y2="{y}"/>')
         parts.append(f'<text class="end" x="{place.left - 5}" y="{place.y(value) + 3.5:.1f}">{text}</text>')
     for value, text in _decades(*place.xs) if place.log else _ticks(*place.xs, 5):
@@ -159,11 +182,15 @@ def _band(line: Line, place: _Place) -> str:
 
 
 def _line(line: Line, place: _Place, say_beyond: bool) -> str:
-    parts, piece = [], list[str]()
+    parts, piece, told = [], list[str](), -math.inf
     for x, y in zip(line.x, line.y, strict=True):
         if np.isfinite(x) and np.isfinite(y):
             piece.append(place.point(x, y))
-            parts.append(_dot(line, place, x, y, say_beyond))
+            # The values of neighbours beyond the frame would lie on each other.
+            beyond = not place.ys[0] <= y <= place.ys[1]
+            say = bool(say_beyond and beyond and place.x(x) - told > _APART)
+            told = place.x(x) if say else told
+            parts.append(_dot(line, place, x, y, say))
         elif piece:
             parts.append(_path(line, piece))
             piece = []
@@ -182,7 +209,7 @@ def _dot(line: Line, place: _Place, x: float, y: float, say_beyond: bool) -> str
     up = y > place.ys[1]
     edge, tip = (place.top, -6) if up else (place.bottom, 6)
     side = "end" if at > (place.left + place.right) / 2 else ""
-    text = f'<text class="{side}" x="{at + (-7 if side else 7):.1f}" y="{edge + (4 if up else -2)}">{number(y)}</text>'
+    text = f'<text class="{side}" x="{at + (-7 if side else 7):.1f}" y="{edge + (13 if up else -6)}">{number(y)}</text>'
     return (
         f'<polygon class="{line.style} fill" points="{at - 4:.1f},{edge} {at + 4:.1f},{edge} {at:.1f},{edge + tip}">'
         f"{value}</polygon>{text * say_beyond}"
@@ -211,10 +238,13 @@ def _ticks(low: float, high: float, count: int) -> list[tuple[float, str]]:
 
 
 def _decades(low: float, high: float) -> list[tuple[float, str]]:
-    """Round numbers on a logarithmic axis."""
+    """Round numbers on a logarithmic axis, 1 among them where it lies within."""
     parts = (1, 2, 5) if high / low < 100 else (1,)
-    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    return [_in_one_unit([v])[0] for n in powers for m in parts if low <= (v := m * 10.0**n) <= high]
+    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    every = math.ceil((last - first) / 8)
+    powers = [n for n in range(first, last + 1) if n % every == 0]
+    values = [v for n in powers for m in parts if low <= (v := m * 10.0**n) <= high]
+    return [_in_one_unit([v])[0] for v in values] if len(values) > 1 else _ticks(low, high, 4)
 
 
 def _in_one_unit(values: list[float]) -> list[tuple[float, str]]:
