@@ -1,5 +1,6 @@
-"""A task in a file that any process can load (`carts.py:CART`), slow enough for a run to be met at work."""
+"""A task in a file that any process can load (`carts.py:CART`), as slow as METRPO_TEST_STEP_SECONDS says."""
 
+import os
 import time
 
 import gymnasium
@@ -9,6 +10,7 @@ from gymnasium.spaces import Box
 import metrpo
 
 HORIZON = 20
+SECONDS = float(os.environ.get("METRPO_TEST_STEP_SECONDS", "0"))
 
 
 def reward(state, action, next_state):
@@ -28,7 +30,7 @@ class Cart(gymnasium.Env):
         return self.state.astype(np.float32), {}
 
     def step(self, action):
-        time.sleep(0.02)
+        time.sleep(SECONDS)
         position, velocity = self.state
         velocity += 0.1 * float(action[0])
         self.state = np.array([position + 0.1 * velocity, velocity])

@@ -104,6 +104,7 @@ def attend(order: Order) -> Ended:
         log = os.open(order.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     except OSError as error:
         raise MetrpoError(f"{node}: cannot write {directory}: {error.strerror or error}") from error
+    os.write(log, f"metrpo: on {node}\n".encode())
     process = subprocess.Popen(
         [sys.executable, "-m", "metrpo.experiments.tied", str(os.getpid()), *order.words],
         stdout=log,
