@@ -26,7 +26,7 @@ from metrpo.run.interrupt import Stopped
 
 RUNS = [Run("Swimmer", "k-1", seed, (("iterations", 3),), "fast") for seed in range(4)]
 ROW = {"iteration": 3, "real_steps": 30, "return_real": 1.5}
-MEANS = Means("ray", jobs=2, cpus=3, gpus=0.5, address="here:1")
+MEANS = Means("ray", jobs=2, cpus=3, gpus=0.5, address="auto")
 
 
 # ---------------------------------------------------------------- options and table
@@ -39,7 +39,7 @@ def test_every_backend_stands_in_the_table_with_the_same_signature():
 
 @pytest.mark.parametrize("command", [["sweep"], ["reproduce", "all"]])
 def test_options(command):
-    typed = ["--backend", "ray", "--jobs", "2", "--cpus", "3", "--gpus", "0.5", "--address", "here:1"]
+    typed = ["--backend", "ray", "--jobs", "2", "--cpus", "3", "--gpus", "0.5", "--address", "auto"]
     assert options.parse([*command, *typed]).means == MEANS
     assert options.parse(command).means == Means("local", None, None, 0.0, None)
 
@@ -163,7 +163,7 @@ def test_what_is_asked_of_ray(on, monkeypatch, tmp_path):
     ray = FakeRay([Ended(0, (ROW,), 7.0)] * 4)
     failed, told = on(ray)
     assert failed == []
-    assert ray.address == "here:1"
+    assert ray.address == "auto"
     assert (ray.asked["num_cpus"], ray.asked["num_gpus"]) == (3, 0.5)
     assert ray.asked["max_retries"] == on_ray.RETRIES
     assert ray.asked["retry_exceptions"] is False
@@ -222,8 +222,10 @@ def test_stopping(on, number, times):
 def test_what_ray_cannot_reach_is_said(on):
     ray = FakeRay([])
     ray.init = lambda **_: (_ for _ in ()).throw(ConnectionError("nobody answers\nand more"))
-    with pytest.raises(MetrpoError, match=r"cannot reach the Ray cluster here:1 \(nobody answers\); start one with"):
+    with pytest.raises(MetrpoError, match=r"cannot reach the Ray cluster auto \(nobody answers\); start one with"):
         on(ray)
+    with pytest.raises(MetrpoError, match=r"cannot reach the Ray cluster 127.0.0.1:1 "):
+        on(FakeRay([]), Means("ray", address="127.0.0.1:1"))
 
 
 # ---------------------------------------------------------------- a machine of the cluster

@@ -10,6 +10,7 @@ import contextlib
 import importlib
 import os
 import signal
+import socket
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -82,9 +83,12 @@ def _import_ray() -> Any:
 def _connected(ray: Any, address: str | None) -> Iterator[None]:
     handler = signal.getsignal(signal.SIGTERM)
     try:
+        if address and ":" in address:  # Ray itself would try for minutes
+            host, _, port = address.rpartition(":")
+            socket.create_connection((host, int(port)), timeout=10).close()
         ray.init(address=address, log_to_driver=False, logging_level="warning")
         signal.signal(signal.SIGTERM, handler)  # Ray has put its own there
-    except (ConnectionError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError) as error:
         raise MetrpoError(
             f"cannot reach the Ray cluster {address or os.environ.get('RAY_ADDRESS', '')} "
             f"({str(error).splitlines()[0]}); start one with: ray start --head"
