@@ -4,7 +4,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup baselines train test test-slow docs lock clean
+.PHONY: help setup baselines ray train test test-slow docs lock clean
 
 PYTHON ?=
 RUN_DIR ?=
@@ -45,6 +45,9 @@ setup: $(READY)  ## only set up .venv
 baselines: $(READY)  ## add what the systems ppo and ddpg need (PyTorch, Stable-Baselines3)
 	$(BIN)/python -m pip install --disable-pip-version-check torch==2.13.0
 	$(BIN)/python -m pip install --disable-pip-version-check 'stable-baselines3>=2.7'
+
+ray: $(READY)  ## add what `--backend ray` needs, and the slow test of it
+	$(BIN)/python -m pip install --disable-pip-version-check 'ray>=2.49'
 
 lock:  ## take the newest versions into the two lock files (needs uv; no other target does)
 	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --fork-strategy requires-python \

@@ -87,6 +87,20 @@ def _no_pictures(monkeypatch):
     monkeypatch.setattr(module, "draw_curve", lambda rows, path, title: None)
 
 
+def test_the_rows_are_published_last(tmp_path, monkeypatch):
+    """By them a run counts as finished and is not begun again: killed before, it must not look so."""
+    seen = []
+
+    def look(rows, path, title):
+        metrics = path.with_name("metrics.csv")
+        published = len(read_metrics(metrics)) if metrics.exists() else 0
+        seen.append((len(rows), published, load_policy(path.parent).info.iteration))
+
+    monkeypatch.setattr(module, "draw_curve", look)
+    train(tmp_path / "run", until=3)
+    assert seen == [(1, 0, 1), (2, 1, 2), (3, 2, 3)]
+
+
 def test_a_run_leaves_what_a_person_can_read(tmp_path):
     train(tmp_path / "a" / "run")
     path = tmp_path / "a" / "run"

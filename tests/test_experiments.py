@@ -16,9 +16,11 @@ import pytest
 from metrpo import options
 from metrpo.config import Config, to_json
 from metrpo.errors import ConfigError
+from metrpo.experiments import local
 from metrpo.experiments import reproduce as running
 from metrpo.experiments.draw import draw
 from metrpo.experiments.figures import FIGURES, PAPER_SECONDS, SCALES, Run, runs_of
+from metrpo.experiments.means import Means
 from metrpo.experiments.publish import publish
 from metrpo.experiments.summary import curves_of, mean_curve, summarise
 from metrpo.presets import preset
@@ -134,8 +136,8 @@ def trained(monkeypatch):
         words = outcomes.get(run, (run.config.iterations, 0, 0))
         return [sys.executable, "-c", TRAIN, str(directory), *map(str, words)]
 
-    monkeypatch.setattr(running, "_command", command)
-    monkeypatch.setattr(running, "_POLL", 0.02)
+    monkeypatch.setattr(local, "_command", command)
+    monkeypatch.setattr(local, "_POLL", 0.02)
     return outcomes, begun
 
 
@@ -145,12 +147,12 @@ def test_only_what_is_missing_is_run(tmp_path, trained):
     first, second, third = runs("k-1", 3)
     write(tmp_path, first, [1, 2, 3])
     write(tmp_path, second, [1, 2])
-    assert running.reproduce([first, second, third], tmp_path, 2, told.append) == []
+    assert running.reproduce([first, second, third], tmp_path, Means(jobs=2), told.append) == []
     assert begun == [second, third]
-    assert told[0] == "1 of 3 runs are finished; 2 to go, 2 at a time"
+    assert told[:2] == ["1 of 3 runs are finished; 2 to go", "2 at a time on this machine"]
     assert sum("return 1.5" in line for line in told) == 2
     begun.clear()
-    assert running.reproduce([first, second, third], tmp_path, 2, told.append) == []
+    assert running.reproduce([first, second, third], tmp_path, Means(jobs=2), told.append) == []
     assert begun == []
 
 
@@ -160,7 +162,7 @@ def test_a_run_that_fails_does_not_stop_the_others_and_is_told_with_its_last_wor
     outcomes[all_runs[0]] = (1, 2, 0)
     outcomes[all_runs[1]] = (2, 0, 0)  # ends without an error, but short of its budget
     told = []
-    assert set(running.reproduce(all_runs, tmp_path, 1, told.append)) == set(all_runs[:2])
+    assert set(running.reproduce(all_runs, tmp_path, Means(jobs=1), told.append)) == set(all_runs[:2])
     assert begun == all_runs
     text = "\n".join(told)
     assert "Swimmer/k-1/seed-0: FAILED" in text
@@ -191,9 +193,9 @@ def test_as_many_at_a_time_as_jobs(tmp_path, monkeypatch):
     def command(run, directory):
         return [sys.executable, "-c", MEET, str(there[run]), str(there[pair[run is pair[0]]])]
 
-    monkeypatch.setattr(running, "_command", command)
-    monkeypatch.setattr(running, "_POLL", 0.02)
-    assert running.reproduce(pair, tmp_path, 2, lambda line: None) == []
+    monkeypatch.setattr(local, "_command", command)
+    monkeypatch.setattr(local, "_POLL", 0.02)
+    assert running.reproduce(pair, tmp_path, Means(jobs=2), lambda line: None) == []
 
 
 def test_stopping_ends_the_runs_too(tmp_path, trained, monkeypatch):
@@ -208,12 +210,12 @@ def test_stopping_ends_the_runs_too(tmp_path, trained, monkeypatch):
         threading.Timer(0.3, signal.raise_signal, [signal.SIGINT]).start()
         return processes[-1]
 
-    monkeypatch.setattr(running.subprocess, "Popen", remembered)
+    monkeypatch.setattr(local.subprocess, "Popen", remembered)
     # A shell that starts the tests in the background has Ctrl-C ignored.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            running.reproduce([run], tmp_path, 1, lambda line: None)
+            running.reproduce([run], tmp_path, Means(jobs=1), lambda line: None)
     finally:
         signal.signal(signal.SIGINT, before)
     assert processes[0].poll() == -signal.SIGTERM
@@ -221,10 +223,20 @@ def test_stopping_ends_the_runs_too(tmp_path, trained, monkeypatch):
 
 
 def test_cores_are_shared_without_overlap(monkeypatch):
-    monkeypatch.setattr(running.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
-    assert running._shares_of_cores(2) == [(0, 1, 2, 3), (4, 5, 6, 7)]
-    assert running._shares_of_cores(8) == [(n,) for n in range(8)]
-    assert running._shares_of_cores(10)[8:] == [(0,), (1,)]
+    monkeypatch.setattr(local.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    assert local.shares_of_cores(2) == [(0, 1, 2, 3), (4, 5, 6, 7)]
+    assert local.shares_of_cores(8) == [(n,) for n in range(8)]
+    assert local.shares_of_cores(10)[8:] == [(0,), (1,)]
+    assert local.shares_of_cores(2, 3) == [(0, 1, 2), (3, 4, 5)]
+    assert local.shares_of_cores(1, 9) == [tuple(range(8))]
+
+
+def test_more_cores_for_each_are_fewer_runs_at_a_time(tmp_path, trained, monkeypatch):
+    monkeypatch.setattr(local.machine, "cores", lambda: 8)
+    for means, jobs in ((Means(), 8), (Means(cpus=3), 2), (Means(cpus=9), 1), (Means(cpus=3, jobs=5), 5)):
+        told = []
+        assert local.run_locally([], tmp_path, means, told.append) == []
+        assert told == [f"{jobs} at a time on this machine"]
 
 
 def test_other_settings_on_disk_are_found(tmp_path):

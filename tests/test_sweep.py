@@ -10,6 +10,7 @@ from metrpo import cli, options
 from metrpo.config import Config
 from metrpo.errors import ConfigError, TaskError
 from metrpo.experiments import reproduce
+from metrpo.experiments.means import Means
 from metrpo.experiments.sweep import Grid, from_file, seeds_of, values_of
 from metrpo.run import machine
 
@@ -122,15 +123,15 @@ def test_a_wrong_file_is_named(tmp_path, text, message):
 def test_the_command_runs_the_grid_and_says_how_it_ended(tmp_path, monkeypatch, capsys):
     asked = []
 
-    def two_of_three(runs, out, jobs, tell):
-        asked.append((len(runs), out, jobs))
+    def two_of_three(runs, out, means, tell):
+        asked.append((len(runs), out, means))
         return runs[:1]
 
     monkeypatch.setattr(reproduce, "reproduce", two_of_three)
     command = ["sweep", "--set", "ensemble.members=1,5", "--seeds", "0:2", "--jobs", "3", "--out", str(tmp_path)]
     assert cli.main(command) == 1
     assert "1 of 4 runs failed" in capsys.readouterr().err
-    assert asked == [(4, tmp_path, 3)]
+    assert asked == [(4, tmp_path, Means(jobs=3))]
     assert cli.main([*command, "--dry-run"]) == 0
     assert capsys.readouterr().out.count("metrpo train Swimmer") == 4
     assert len(asked) == 1

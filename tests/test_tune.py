@@ -523,12 +523,11 @@ def test_a_run_that_survived_its_tune_is_watched_stopped_and_taken_over(tmp_path
     directory, started = tmp_path / run.name, []
     directory.mkdir(parents=True)
 
-    class Started:
-        def __init__(self, run, out, cores):
-            started.append((run, out, cores))
-            self.process = FakeWorker(Fake(), run, out)
+    def begun(run, out, cores):
+        started.append((run, out, cores))
+        return FakeWorker(Fake(), run, out)
 
-    monkeypatch.setattr(workers, "_start", Started)
+    monkeypatch.setattr(workers, "start", begun)
     for asked in (True, False):
         held = subprocess.Popen([sys.executable, "-c", HOLDS, str(directory)], stdout=subprocess.PIPE, text=True)
         try:

@@ -265,7 +265,6 @@ def _reproduce(command: Reproduce) -> int:
     from metrpo.experiments.figures import FIGURES, runs_of
     from metrpo.experiments.publish import publish
     from metrpo.experiments.reproduce import reproduce
-    from metrpo.run.machine import cores
 
     def tell(text: str) -> None:
         print(text, file=sys.stderr if command.json else sys.stdout, flush=True)
@@ -277,7 +276,7 @@ def _reproduce(command: Reproduce) -> int:
     failed = []
     try:
         if command.run:
-            failed = reproduce(runs, out, command.jobs or cores(), tell)
+            failed = reproduce(runs, out, command.means, tell)
     except (KeyboardInterrupt, Stopped):
         _say(f"metrpo: stopped; {out} keeps every finished iteration. The same command goes on.")
         raise
@@ -297,7 +296,6 @@ def _json(numbers: Mapping[str, float | None]) -> str:
 def _sweep(command: Sweep) -> int:
     from metrpo.experiments.reproduce import reproduce
     from metrpo.experiments.sweep import Grid, from_file, seeds_of, values_of
-    from metrpo.run.machine import cores
 
     if command.spec is not None:
         grid = from_file(command.spec)
@@ -312,7 +310,7 @@ def _sweep(command: Sweep) -> int:
         return 0
     signal.signal(signal.SIGTERM, stop)
     try:
-        failed = reproduce(runs, command.out, command.jobs or cores(), lambda text: print(text, flush=True))
+        failed = reproduce(runs, command.out, command.means, lambda text: print(text, flush=True))
     except (KeyboardInterrupt, Stopped):
         _say(f"metrpo: stopped; {command.out} keeps every finished iteration. The same command goes on.")
         raise

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, OmitSubcommandPrefixes, Positional, arg, subcommand
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
 
 from metrpo.config import Config, Preset, System
 from metrpo.errors import ConfigError
+from metrpo.experiments.means import Means
 
 _BUDGET = tyro.conf.create_mutex_group(required=False)
 
@@ -218,6 +219,7 @@ class Reproduce:
         metrpo reproduce all --scale smoke
         metrpo reproduce optimizers --scale laptop --tasks Swimmer --seeds 3 --jobs 2
         metrpo reproduce all --scale laptop --no-run      # draws only
+        metrpo reproduce all --scale paper --backend ray --gpus 1 --out /shared/paper
     """
 
     figure: Annotated[Positional[str], arg(metavar="FIGURE")]
@@ -228,20 +230,17 @@ class Reproduce:
     """Only these of the figure's tasks; default: the scale's."""
     seeds: Annotated[int | None, arg(metavar="INT")] = None
     """Seeds 0, 1, ... of each system; default: the scale's."""
-    jobs: Annotated[int | None, arg(metavar="INT")] = None
-    """Runs at a time, on cores of their own; default: one for each core."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of the runs and of figures/; default: runs/reproduce-<scale>."""
     run: bool = True
     """Run what is missing."""
     json: bool = False
     """Print the figures' numbers as JSON."""
+    means: Annotated[Means, OmitArgPrefixes] = field(default_factory=Means)
 
     def __post_init__(self) -> None:
-        for name in ("seeds", "jobs"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ConfigError(f"{name}: expected at least 1, got {value}")
+        if self.seeds is not None and self.seeds < 1:
+            raise ConfigError(f"seeds: expected at least 1, got {self.seeds}")
 
 
 @dataclass(frozen=True)
@@ -252,6 +251,7 @@ class Sweep:
         metrpo sweep --tasks Swimmer HalfCheetah --seeds 0:5 --out runs/seeds
         metrpo sweep --tasks Swimmer --set ensemble.members=1,5,10 trpo.max_kl=0.01,0.03 --seeds 0:3 --jobs 4
         metrpo sweep grid.toml --dry-run
+        metrpo sweep grid.toml --backend ray --out /shared/sweep      # on a Ray cluster: docs/many-runs.md
 
     where grid.toml holds, say:
         tasks = ["Swimmer"]
@@ -271,16 +271,11 @@ class Sweep:
     """What all other settings start from."""
     set: tuple[str, ...] = ()
     """Settings and their values: ensemble.members=1,5,10 or ensemble.hidden=[200,200],[512]."""
-    jobs: Annotated[int | None, arg(metavar="INT")] = None
-    """Runs at a time, on cores of their own; default: one for each core."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("runs/sweep")
     """Folder of the runs: <task>/<system>,<setting>=<value>/seed-<seed>."""
     dry_run: bool = False
     """Only say what would be run."""
-
-    def __post_init__(self) -> None:
-        if self.jobs is not None and self.jobs < 1:
-            raise ConfigError(f"jobs: expected at least 1, got {self.jobs}")
+    means: Annotated[Means, OmitArgPrefixes] = field(default_factory=Means)
 
 
 @dataclass(frozen=True)

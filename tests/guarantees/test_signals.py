@@ -14,7 +14,7 @@ import pytest
 
 import tiny_run
 from metrpo import cli, stepwise
-from metrpo.experiments import reproduce
+from metrpo.experiments import local
 from metrpo.run import files
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.interrupt import Interruptible, Stopped
@@ -179,10 +179,10 @@ def test_several_runs_are_asked_twice():
     assert process.stdout.readline() == b"ready\n"
     process.stdout.close()
     told = []
-    child = reproduce._Child(None, process, (), 0.0)
+    child = local._Child(None, process, (), 0.0)
     threading.Timer(0.3, os.kill, [os.getpid(), signal.SIGINT]).start()
     with pytest.raises(KeyboardInterrupt):
-        reproduce._stop([child], told.append)
+        local._stop([child], told.append)
     assert process.poll() == 0
     assert told == ["stopping 1 runs after their iteration; once more stops them at once"]
 

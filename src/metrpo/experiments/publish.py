@@ -9,7 +9,8 @@ from typing import Any
 
 from metrpo.experiments.draw import draw
 from metrpo.experiments.figures import FIGURES, Run
-from metrpo.experiments.reproduce import differences, is_finished, rows_of, runs_there
+from metrpo.experiments.reproduce import differences, runs_there
+from metrpo.experiments.standing import is_finished, rows_of
 from metrpo.experiments.summary import as_markdown, summarise
 from metrpo.run.files import atomic_write
 

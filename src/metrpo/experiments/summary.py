@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from metrpo.experiments.figures import FIGURES, Run
-from metrpo.experiments.reproduce import rows_of
+from metrpo.experiments.standing import rows_of
 from metrpo.experiments.statistics import (
     at_steps,
     iqm,

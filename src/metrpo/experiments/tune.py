@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import signal
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import fmean
@@ -13,8 +12,9 @@ from typing import TYPE_CHECKING
 
 from metrpo.errors import MetrpoError
 from metrpo.experiments.figures import Run
-from metrpo.experiments.reproduce import _shares_of_cores, rows_of
+from metrpo.experiments.local import shares_of_cores
 from metrpo.experiments.search import Search, worth
+from metrpo.experiments.standing import Tell, log_of, rows_of, tail
 from metrpo.experiments.study import ask, opened_study, taken_up
 from metrpo.experiments.tuned import Tuned, shown, tuned
 from metrpo.experiments.workers import Begin, Cores, Orphan, Worker, begin
@@ -26,11 +26,8 @@ if TYPE_CHECKING:
     from optuna import Study, Trial
     from optuna.trial import TrialState
 
-Tell = Callable[[str], None]
 _POLL = 0.5
 """Seconds between two looks at the runs."""
-_TAIL = 5
-"""Lines of a failed run's log that are kept."""
 _HOPELESS = 3
 """Failures in a session before anything goes well, after which no further trial is begun."""
 
@@ -77,7 +74,7 @@ class _Tuning:
 
     def __init__(self, search: Search, study: Study, out: Path, jobs: int, tell: Tell, begin: Begin) -> None:
         self._search, self._study, self._out, self._tell, self._begin = search, study, out, tell, begin
-        seeds, shares = len(search.seeds), _shares_of_cores(jobs * len(search.seeds))
+        seeds, shares = len(search.seeds), shares_of_cores(jobs * len(search.seeds))
         self._free = [shares[i * seeds : (i + 1) * seeds] for i in range(jobs)]
         self._going: list[_Going] = []
         self._failed, self._hopeful = 0, any(t.state.name == "COMPLETE" for t in study.get_trials(deepcopy=False))
@@ -205,8 +202,8 @@ class _Tuning:
         codes = {run: worker.poll() for run, worker in going.workers.items()}
         short = [run for run in codes if not self._search.is_spent(rows_of(run, self._out))] or list(codes)
         run = next((run for run in short if codes[run] != 128 + signal.SIGTERM), short[0])
-        log = self._out / f"{run.name}.log"
-        lines = log.read_text(errors="replace").splitlines()[-_TAIL:] if log.exists() else []
+        log = log_of(run, self._out)
+        lines = tail(log) if log.exists() else []
         return "\n      ".join([f"exit code {codes[run]}; the end of {log}:", *lines])
 
     def _stop_all(self) -> None:

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Protocol
 
 from metrpo.experiments.figures import Run
-from metrpo.experiments.reproduce import _start, is_finished
+from metrpo.experiments.local import start
+from metrpo.experiments.standing import is_finished
 from metrpo.seeing.watch import is_running
 
 Cores = tuple[int, ...]
@@ -37,7 +38,7 @@ Begin = Callable[[Run, Path, Cores], Worker]
 
 def begin(run: Run, out: Path, cores: Cores) -> Worker:
     """The run as a `metrpo train` of its own on these cores, or the one that is still at it."""
-    return Orphan(run, out, cores) if is_running(out / run.name) else _start(run, out, cores).process
+    return Orphan(run, out, cores) if is_running(out / run.name) else start(run, out, cores)
 
 
 class Orphan:
@@ -55,7 +56,7 @@ class Orphan:
                 return None
             if self._asked or is_finished(self._run, self._out):
                 return 0
-            self._process = _start(self._run, self._out, self._cores).process
+            self._process = start(self._run, self._out, self._cores)
         return self._process.poll()
 
     def terminate(self) -> None:

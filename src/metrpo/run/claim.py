@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import platform
+import time
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +18,13 @@ from metrpo.config import Config
 from metrpo.errors import ConfigError, RunDirectoryError
 from metrpo.run.files import FORMAT, atomic_write, check_format, make_directory, metrpo_version, source_commit
 from metrpo.untrusted import json_of, text_of
+
+_POLL = 1.0
+"""Seconds between two looks at a lock."""
+
+
+class DirectoryInUse(RunDirectoryError):
+    """Another process holds the run directory."""
 
 
 def claim(path: Path, config: Config) -> TextIO:
@@ -34,6 +42,22 @@ def claim(path: Path, config: Config) -> TextIO:
         lock.close()
         raise
     return lock
+
+
+def wait_until_free(path: Path, seconds: float) -> None:
+    """Returns as soon as no process holds the run directory `path`, an existing folder.
+
+    Raises `DirectoryInUse` when one still does after so many seconds, `RunDirectoryError` when it cannot be locked.
+    """
+    deadline = time.monotonic() + seconds
+    while True:
+        try:
+            hold(path).close()
+            return
+        except DirectoryInUse:
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(_POLL)
 
 
 def _create(path: Path) -> None:
@@ -64,7 +88,7 @@ def hold(path: Path) -> TextIO:
         file.seek(0)
         holder = file.read(20).strip() or "unknown"
         file.close()
-        raise RunDirectoryError(
+        raise DirectoryInUse(
             f"{path} is in use by another process (pid {holder}): wait for it, end it, or choose another directory"
         ) from None
     except OSError as error:

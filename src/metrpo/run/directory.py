@@ -221,16 +221,16 @@ class RunDirectory:
                 old.unlink()
         result = self.rows[-1].get("return_real") if self.rows else None
         result = result if result is not None and math.isfinite(result) else None
-        if self.rows:
-            atomic_write(self.path / "metrics.csv", to_csv([overview(row) for row in self.rows]))
-            if all(rows := [details(row) for row in self.rows]):
-                atomic_write(self.path / "diagnostics.csv", to_csv(rows))
         save_policy(self.path, state.policy, self.config.task, state.iteration, state.real_steps, result)
         if not self.rows:
             return
         title = f"{self.config.task}, {self.config.system}, {self.config.preset}, seed {self.config.seed}"
         self._derive("learning curve", lambda: draw_curve(self.rows, self.path / "curve.png", title))
         self._derive("TensorBoard events", self._write_events)
+        if all(rows := [details(row) for row in self.rows]):
+            atomic_write(self.path / "diagnostics.csv", to_csv(rows))
+        # Last: a run counts as finished, and is not begun again, by the rows in this file.
+        atomic_write(self.path / "metrics.csv", to_csv([overview(row) for row in self.rows]))
 
     def _write_events(self) -> None:
         if self._events is None or not self._events.path.exists():

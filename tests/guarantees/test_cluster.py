@@ -1,0 +1,147 @@
+"""A Ray cluster of three nodes on one machine: one is lost, the driver is killed, and nothing is missing in the end."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from metrpo import read_metrics
+from metrpo.experiments.standing import words
+from metrpo.experiments.sweep import Grid, values_of
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.timeout(1200),
+    pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray: make ray, or pip install 'metrpo[ray]'"),
+]
+
+CART = f"{Path(__file__).parents[1] / 'carts.py'}:CART"
+RUNS = 12
+FAILS = 3
+"""Seed of the run that always does; the first three are under way at the same time."""
+ITERATIONS = 3
+TINY = {
+    "deterministic": True,
+    "trust_reward": True,
+    "iterations": ITERATIONS,
+    "evaluation_episodes": 1,
+    "collect.steps": 40,
+    "ensemble.members": 2,
+    "ensemble.hidden": "[8]",
+    "fit.max_passes": 4,
+    "imagine.steps": 60,
+    "validate.max_updates": 4,
+}
+DERIVED = ("metrics.csv", "policy.npz", "config.json", f"checkpoints/iteration-{ITERATIONS:05d}.npz")
+
+ENVIRONMENT = os.environ | {"MUJOCO_GL": "disabled"}
+SLOW = ENVIRONMENT | {"METRPO_TEST_STEP_SECONDS": "0.05"}
+ALONE = """
+import sys
+from metrpo import cli
+for line in sys.stdin:
+    assert cli.main(line.rstrip("\\n").split("\\t")) == 0
+"""
+
+
+@pytest.fixture
+def cluster():
+    """Three machines, as far as Ray can tell, with one core each; the driver belongs to the first."""
+    from ray.cluster_utils import Cluster
+
+    small = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+        found = Cluster(initialize_head=True, head_node_args={**small, "include_dashboard": False})
+        try:
+            for _ in range(2):
+                found.add_node(**small)
+            yield found
+        finally:
+            found.shutdown()
+
+
+def runs():
+    """By seed; that of `FAILS` is going to fail."""
+    settings = dict(values_of(f"{name}={value}") for name, value in TINY.items())
+    return Grid((CART,), seeds=tuple(range(RUNS + 1)), settings=settings).runs()
+
+
+def sweep(cluster, out):
+    grid = [f"{name}={value}" for name, value in TINY.items()]
+    command = ["sweep", "--tasks", CART, "--seeds", f"0:{RUNS + 1}", "--set", *grid, "--out", str(out)]
+    return subprocess.Popen(
+        [sys.executable, "-m", "metrpo", *command, "--backend", "ray", "--address", cluster.address],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=SLOW,
+    )
+
+
+@pytest.fixture
+def alone(tmp_path):
+    """The runs one after the other, in a process that does nothing else."""
+    out = tmp_path / "alone"
+    lines = "\n".join("\t".join(words(run, out / run.name)) for run in runs() if run.seed != FAILS)
+    command = [sys.executable, "-c", ALONE]
+    subprocess.run(command, input=lines, text=True, check=True, stdout=subprocess.DEVNULL, env=ENVIRONMENT)
+    return out
+
+
+def metrics(out):
+    return list(out.glob("*/*/seed-*/metrics.csv"))
+
+
+def finished(out):
+    return [path for path in metrics(out) if len(read_metrics(path)) == ITERATIONS]
+
+
+def under_way(out):
+    """How many runs have finished an iteration and not all."""
+    return len(metrics(out)) - len(finished(out))
+
+
+def begun_again(out):
+    """How many runs have been begun more than once."""
+    return sum(log.read_text().count("metrpo: on ") > 1 for log in out.glob("*/*/seed-*.log"))
+
+
+def wait_for(driver, condition):
+    while not condition():
+        assert driver.poll() is None, driver.communicate()[0]
+        time.sleep(0.1)
+
+
+def test_a_lost_node_and_a_killed_driver_cost_nothing(alone, cluster, tmp_path):
+    out, everything = tmp_path / "out", runs()
+    fails = out / everything[FAILS].name
+    fails.mkdir(parents=True)
+    (fails / "notes.txt").touch()  # metrpo writes into no folder that holds something else
+
+    driver = sweep(cluster, out)
+    wait_for(driver, lambda: under_way(out) == 3)
+    cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+    wait_for(driver, lambda: begun_again(out) and len(finished(out)) >= RUNS // 2 and under_way(out))
+    driver.send_signal(signal.SIGKILL)
+    driver.communicate()
+    before = {path: path.stat().st_mtime_ns for path in finished(out)}
+    assert len(before) < RUNS, "killed too late"
+
+    driver = sweep(cluster, out)
+    text, _ = driver.communicate()
+    assert driver.returncode == 1, text
+    assert f"{len(before)} of 13 runs are finished" in text
+    assert f"seed-{FAILS}: FAILED" in text
+    assert "notes.txt" in text
+    assert "1 of 13 runs failed" in text
+    assert {path: path.stat().st_mtime_ns for path in before} == before, "finished runs are left alone"
+    assert begun_again(out) >= 3, "that of the lost node, one that was under way when the driver died, the failing one"
+    for run in everything:
+        for name in DERIVED if run.seed != FAILS else ():
+            assert (out / run.name / name).read_bytes() == (alone / run.name / name).read_bytes(), f"{run.name}: {name}"
