@@ -146,6 +146,7 @@ def test_another_structure_is_refused(tmp_path, template, what):
     ("leaf", "what"),
     [
         (np.zeros((9, 4), np.float32), r"has \['x'\] of shape \[2, 3\] instead of \['n', 4\]"),
+        (np.zeros((2, 2), np.float32), r"has \['x'\] of shape \[2, 3\] instead of \['n', 2\]"),
         (jnp.zeros((9, 3)), r"has \['x'\] of shape \[2, 3\] instead of \[9, 3\]"),
         (jnp.zeros((2, 4)), r"has \['x'\] of shape \[2, 3\] instead of \[2, 4\]"),
     ],
