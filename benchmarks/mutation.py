@@ -14,10 +14,7 @@ of survivors why no test can tell them from the original. Exit code 1: there are
 from __future__ import annotations
 
 import argparse
-import ast
 import csv
-import difflib
-import hashlib
 import importlib
 import json
 import os
@@ -32,16 +29,19 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
-from itertools import count
 from pathlib import Path
 
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # a process with threads must not fork
     os.environ[variable] = "1"
-os.environ["JAX_PLATFORMS"] = "cpu"
+# Mutants are compiled more than they are run: a third of the time is gone without optimisations.
+flags = "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+os.environ |= {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
 
 import jax  # noqa: E402 (the environment must stand first)
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, Phase, settings  # noqa: E402
+from mutants import FIELDS, mutants  # noqa: E402
+from scipy.stats import binomtest  # noqa: E402
 
 for module in (
     "gymnasium",
@@ -56,7 +56,6 @@ for module in (
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "results" / "mutation"
-FIELDS = ("mutant", "line", "operator", "before", "after", "outcome", "by")
 LEARNED = "tests/test_environments.py::test_the_dataset_holds_reward_and_end_where_they_are_learned"
 MODULES = {
     "trpo": ("src/metrpo/policy/trpo.py", ["tests/test_trpo.py"]),
@@ -67,46 +66,6 @@ MODULES = {
 }
 PATIENCE = 600
 """Seconds of silence after which a mutant counts as hanging without work."""
-
-
-def mutants(source: str) -> Iterator[dict[str, str]]:
-    """Every different mutant of `source`: a row of the record, and its text as `text`."""
-    from cosmic_ray.mutating import mutate_code
-    from cosmic_ray.plugins import get_operator, operator_names
-
-    seen = {meaning(source)}
-    for name in sorted(operator_names()):
-        operator = get_operator(name)
-        if operator.arguments():
-            continue
-        for occurrence in count():
-            text = mutate_code(source, operator(), occurrence)
-            if text is None:
-                break
-            if (what := meaning(text)) in seen or what is None:
-                continue
-            seen.add(what)
-            changes = [d for d in difflib.ndiff(source.splitlines(), text.splitlines()) if d[0] in "+-"]
-            before, after = (" ".join(d[2:].strip() for d in changes if d[0] == sign) for sign in "-+")
-            pairs = zip(source.splitlines(), text.splitlines(), strict=False)
-            line = next(n for n, (a, b) in enumerate(pairs, 1) if a != b)
-            digest = hashlib.sha256(text.encode()).hexdigest()[:12]
-            cells = (digest, str(line), name.removeprefix("core/"), before, after)
-            yield dict(zip(FIELDS, cells, strict=False)) | {"text": text}
-
-
-def meaning(text: str) -> str | None:
-    """What a module does, as text: its syntax tree without annotations; None where it has none."""
-    try:
-        tree = ast.parse(text)
-    except SyntaxError:
-        return None
-    for node in ast.walk(tree):
-        if isinstance(node, ast.arg | ast.AnnAssign):
-            node.annotation = ast.Constant(None)
-        elif isinstance(node, ast.FunctionDef):
-            node.returns = None
-    return ast.dump(tree)
 
 
 class Watch:
@@ -136,6 +95,7 @@ class Watch:
 def in_child(copy: Path, tests: list[str], watch: Watch, pipe: int) -> None:
     """Runs `tests` in `copy` in this forked process, which ends; a JSON line into `pipe` says what happened."""
     os.setsid()
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     out = os.open(copy / "output.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(out, 1)
     os.dup2(out, 2)
@@ -182,12 +142,14 @@ def verdict(
             os._exit(70)
     os.close(writer)
     said = b""
-    with open(reader, "rb", buffering=0) as pipe:
-        while (ready := select.select([pipe], [], [], PATIENCE)[0]) and (more := pipe.read(65536)):
-            said += more
-    with suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGKILL)
-    status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    try:
+        with open(reader, "rb", buffering=0) as pipe:
+            while (ready := select.select([pipe], [], [], PATIENCE)[0]) and (more := pipe.read(65536)):
+                said += more
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(child, signal.SIGKILL)
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if said:
         code, failed, took = json.loads(said)
         if code not in (0, 1, 2) or "HealthCheck" in failed:
@@ -236,6 +198,12 @@ def run(name: str, fresh: bool, minutes: float, explained: set[tuple[str, str, s
     return rows
 
 
+def share(hits: int, of: int, exact: bool) -> str:
+    """A share in words; of a random sample, with Wilson's interval."""
+    low, high = binomtest(hits, of).proportion_ci(method="wilson")
+    return f"{hits / of:.1%}" + ("" if exact else f" ({low:.1%} to {high:.1%})")
+
+
 def read(path: Path) -> list[dict[str, str]]:
     """The rows of a CSV file, none of one that is not there."""
     if not path.exists():
@@ -262,16 +230,18 @@ if __name__ == "__main__":
         "--minutes", type=float, default=float("inf"), help="per module: a random sample of the mutants"
     )
     options = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # which takes the child and the copy along
     explained = {(row["module"], row["before"], row["after"]) for row in read(RECORDS / "equivalent.csv")}
     holes = 0
-    columns = ("module", "mutants", "run", "killed", "timeout", "equivalent", "survived")
+    columns = ("module", "mutants", "run", "killed", "timeout", "equivalent", "survived", "killed of what can be, 95 %")
     print("|", " | ".join(columns), "|\n|", " | ".join("---" for _ in columns), "|")
     for name in options.modules or MODULES:
         rows = run(name, options.fresh, options.minutes, explained)
         found = Counter(row.get("outcome") for row in rows)
         survived = [row for row in rows if row.get("outcome") == "survived"]
         equal = sum((name, row["before"], row["after"]) in explained for row in survived)
-        holes += len(survived) - equal
-        cells = (len(rows), len(rows) - found[None], found["killed"], found["timeout"], equal, len(survived) - equal)
-        print("|", name, *(f"| {cell}" for cell in cells), "|", flush=True)
+        counts = (len(rows), len(rows) - found[None], found["killed"], found["timeout"], equal, len(survived) - equal)
+        cells = (name, *counts, share(found["killed"] + found["timeout"], counts[1] - equal, exact=not found[None]))
+        print("|", " | ".join(str(cell) for cell in cells), "|", flush=True)
+        holes += counts[-1]
     sys.exit(holes > 0)
