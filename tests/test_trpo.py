@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from helpers import on_host, random_policy, slow_mean
 from metrpo.config import TRPOConfig
-from metrpo.policy import gaussian, trpo
+from metrpo.policy import gaussian, linearised, trpo
 from metrpo.policy.batch import Batch
 from metrpo.policy.linearised import chunked, linearise
 
@@ -225,6 +225,25 @@ def test_every_try_of_the_line_search_counts():
         assert (info.accepted, info.backtracks) == (tries > failing, tries - 1)
 
 
+def test_the_first_try_that_passes_is_taken():
+    """Against a line search in NumPy along the same step."""
+    found = set()
+    for seed in range(8):
+        policy, config = random_policy(seed, hidden=(5,)), TRPOConfig(max_kl=0.5)
+        batch = a_batch(seed + 1, policy)
+        new, info = improve(policy, batch, config)
+        flat, unravel = ravel_pytree(policy)
+        full = (ravel_pytree(new)[0] - flat) / 0.8**info.backtracks
+        start, _ = slow_surrogate_and_kl(policy, policy, batch)
+        tries = [
+            slow_surrogate_and_kl(policy, unravel(flat + 0.8**i * full), batch) for i in range(info.backtracks + 1)
+        ]
+        passes = [gain > start and divergence <= config.max_kl for gain, divergence in tries]
+        assert passes == [False] * int(info.backtracks) + [True]
+        found.add(int(info.backtracks))
+    assert found >= {0, 1, 2, 3}
+
+
 def test_a_gain_that_overflows_is_none():
     """One action lies so far out that its ratio is infinite after any step, though the policy moves by max_kl only."""
     policy = gaussian.Policy(((np.zeros((1, 1), np.float32), np.zeros(1, np.float32)),), np.zeros(1, np.float32))
@@ -239,16 +258,21 @@ def test_a_gain_that_overflows_is_none():
 
 
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
-def test_the_residual_is_relative_to_the_gradient(size):
-    """After one step of steepest descent, x = a g: |g - a F g| / |g|, whatever the unit of the advantages."""
+def test_after_one_iteration_residual_and_step_are_those_of_steepest_descent(size):
+    """x = a g: residual |g - a F g| / |g|, and a step as long as F says, whatever the unit of the advantages."""
     policy = random_policy(11, hidden=(3,))
     batch = a_batch(12, policy)
     batch = batch._replace(advantages=(size * batch.advantages).astype(np.float32))
     gradient = surrogate_gradient(policy, batch)
     image = (dense_fisher(policy, batch.states, batch.mask) + 0.05 * np.eye(gradient.size)) @ gradient
     left = gradient - image * (gradient @ gradient) / (gradient @ image)
-    _, info = improve(policy, batch, TRPOConfig(cg_iterations=1, damping=0.05))
+    config = TRPOConfig(max_kl=1e-3, cg_iterations=1, damping=0.05)
+    new, info = improve(policy, batch, config)
+    assert info.accepted
     assert float(info.cg_residual) == pytest.approx(np.linalg.norm(left) / np.linalg.norm(gradient), rel=1e-3)
+    full = gradient * np.sqrt(2 * config.max_kl / (gradient @ image))
+    step = ravel_pytree(new)[0] - ravel_pytree(policy)[0]
+    np.testing.assert_allclose(step, full * 0.8 ** int(info.backtracks), atol=2e-3 * np.abs(full).max())
 
 
 def test_a_single_step_says_what_it_says_twice():
@@ -261,6 +285,18 @@ def test_a_single_step_says_what_it_says_twice():
     assert improve(policy, once, config)[1].accepted
     for ours, theirs in zip(*(jax.tree.leaves(improve(policy, b, config)) for b in (once, twice)), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_a_batch_in_chunks_says_what_it_says_whole(monkeypatch):
+    """24 steps at once, and as two chunks of 10 and a padded one."""
+    policy, config = random_policy(3, hidden=(5,)), TRPOConfig(damping=0.1)
+    batch = a_batch(4, policy)
+    whole = improve(policy, batch, config)
+    monkeypatch.setattr(linearised, "CHUNK", 10)
+    in_chunks = on_host()(lambda policy, batch: trpo.improve(policy, batch, config))(policy, batch)
+    assert in_chunks[1].accepted
+    for ours, theirs in zip(jax.tree.leaves(in_chunks), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-5)
 
 
 @pytest.mark.parametrize("poison", ["advantages", "actions", "states"])
