@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -11,16 +10,12 @@ from types import SimpleNamespace
 
 import pytest
 
-import tiny_run
-from faults import Disk
 from metrpo.errors import RunDirectoryError
 from metrpo.experiments import on_node, sent, store
 from metrpo.experiments.on_node import Ended, Order
 from metrpo.experiments.sent import Copy
 from metrpo.experiments.store import Changes, Store, Superseded
 from metrpo.run import claim
-from metrpo.run.metrics import read_metrics
-from metrpo.training import train
 
 RUN = "Task/k-1/seed-0"
 
@@ -365,58 +360,3 @@ def test_what_the_store_raises_is_raised_on_the_other_machine(kept, out, monkeyp
         actor.take(RUN, 0, changes())
     actor.end(RUN, 1)
     claim.hold(out / RUN).close()
-
-
-# ---------------------------------------------------------------- both, broken off anywhere
-
-
-def session(out, node, disk):
-    """One command: the store, and a machine with an empty folder that sends after everything it does to a file."""
-    keeper = Store(str(out))
-    node.parent.mkdir()
-    log = node.with_suffix(".log")
-    log.touch()
-    try:
-        with disk, pytest.MonkeyPatch.context() as patch:
-            copy = Copy(keeper, RUN, node, log)
-
-            def hooked(real):
-                def act(*arguments, **named):
-                    real(*arguments, **named)
-                    if str(arguments[-1]).startswith(str(node)):
-                        copy.send()
-
-                return act
-
-            for name in ("replace", "link", "unlink"):
-                patch.setattr(os, name, hooked(getattr(os, name)))
-            train(tiny_run.CONFIG, node)
-            copy.send()
-    finally:
-        for lock in keeper._locks.values():
-            lock.close()
-
-
-def numbers(run_dir):
-    return [int(re.sub(r"\D", "", path.name)) for path in run_dir.glob("checkpoints/iteration-*.npz")]
-
-
-@pytest.mark.timeout(600)
-@pytest.mark.parametrize("fault", ["kill", "power"])
-def test_broken_off_at_any_operation_the_driver_has_a_run_to_go_on_with(fault, tmp_path):
-    with tiny_run.cheap():
-        train(tiny_run.CONFIG, tmp_path / "alone")
-        expected = tiny_run.result(tmp_path / "alone")
-        whole = Disk(tmp_path / "whole")
-        session(tmp_path / "whole", tmp_path / "whole-node" / "run", whole)
-        assert tiny_run.differing(tiny_run.result(tmp_path / "whole" / RUN), expected) == []
-        assert whole.count > 200
-        for at in range(1, whole.count + 1, 7):
-            out = tmp_path / f"out-{at}"
-            disk = Disk(out, at, fault)
-            session(out, tmp_path / f"first-{at}" / "run", disk)
-            assert disk.hit
-            if (metrics := out / RUN / "metrics.csv").exists():
-                assert len(read_metrics(metrics)) <= max(numbers(out / RUN)), disk.done[-1]
-            session(out, tmp_path / f"second-{at}" / "run", Disk(out))
-            assert tiny_run.differing(tiny_run.result(out / RUN), expected) == [], disk.done[-1]
