@@ -94,7 +94,8 @@ def _connected(ray: Any, address: str | None) -> Iterator[None]:
     except (OSError, RuntimeError, ValueError) as error:
         raise MetrpoError(
             f"cannot reach the Ray cluster {address or os.environ.get('RAY_ADDRESS', '')} "
-            f"({str(error).splitlines()[0]}); start one with: ray start --head"
+            f"({str(error).splitlines()[0]}); start one with: ray start --head; if one is there and says "
+            "InvalidAuthToken: export RAY_AUTH_MODE=token"
         ) from error
     try:
         yield
