@@ -173,6 +173,17 @@ def test_standardise_of_nothing_and_of_equals_is_zero():
     zeros, ones = np.zeros((T, N), np.float32), np.ones((T, N), np.float32)
     assert not np.any(standardise(ones, zeros))
     assert not np.any(standardise(7 * ones, ones))
+    single = zeros.copy()
+    single[3, 2] = 1
+    assert not np.any(standardise(7 * ones, single)), "the mean over one step is that step"
+
+
+@pytest.mark.parametrize("size", [1e-8, 1e-3, 1e4])
+def test_standardise_makes_one_of_any_spread_but_of_rounding(size):
+    """Advantages of +-size become +-1, but for those that differ by 1e-8 only, which are not blown up."""
+    signs = np.where((np.arange(T)[:, None] + np.arange(N)) % 2, 1.0, -1.0)
+    got = standardise((size * signs).astype(np.float32), np.ones((T, N), np.float32))
+    np.testing.assert_allclose(got, signs * size / (size + 1e-8), rtol=1e-4)
 
 
 @given(seeds, shares, shares)

@@ -142,6 +142,36 @@ def test_another_structure_is_refused(tmp_path, template, what):
     assert not isinstance(error.value, DamagedFile)
 
 
+@pytest.mark.parametrize(
+    ("leaf", "what"),
+    [
+        (np.zeros((9, 4), np.float32), r"has \['x'\] of shape \[2, 3\] instead of \['n', 4\]"),
+        (np.zeros((2, 2), np.float32), r"has \['x'\] of shape \[2, 3\] instead of \['n', 2\]"),
+        (jnp.zeros((9, 3)), r"has \['x'\] of shape \[2, 3\] instead of \[9, 3\]"),
+        (jnp.zeros((2, 4)), r"has \['x'\] of shape \[2, 3\] instead of \[2, 4\]"),
+    ],
+)
+def test_only_numpy_arrays_may_have_another_number_of_rows(tmp_path, leaf, what):
+    path = tmp_path / "a.npz"
+    save_state(path, {"x": np.ones((2, 3), np.float32)}, {})
+    loaded, _ = load_state(path, {"x": np.zeros((9, 3), np.float32)})
+    np.testing.assert_array_equal(loaded["x"], np.ones((2, 3)))
+    with pytest.raises(RunDirectoryError, match=what):
+        load_state(path, {"x": leaf})
+
+
+@pytest.mark.parametrize(("wrong", "more"), [(1, ""), (3, ""), (4, " and 1 more"), (7, " and 4 more")])
+def test_three_differences_are_named_and_the_others_counted(tmp_path, wrong, more):
+    path = tmp_path / "a.npz"
+    saved = {f"x{i}": np.zeros(2, np.float32) for i in range(8)}
+    save_state(path, saved, {})
+    template = {name: x.astype(np.float64) if i < wrong else x for i, (name, x) in enumerate(saved.items())}
+    with pytest.raises(RunDirectoryError, match="expected 8 arrays, got 8") as error:
+        load_state(path, template)
+    named = [f"it has ['x{i}'] as float32 of rank 1 instead of float64 of rank 1" for i in range(min(wrong, 3))]
+    assert f"; {'; '.join(named)}{more}. It was written by" in str(error.value)
+
+
 def test_another_format_is_refused_by_name(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     monkeypatch.setattr(files, "FORMAT", 99)

@@ -58,6 +58,23 @@ def test_the_default_split_is_two_to_one():
     assert (dataset.train.size, dataset.validation.size) == (100, 50)
 
 
+@pytest.mark.parametrize(
+    ("fraction", "count", "held_out"), [(0.5, 12, 6), (0.75, 12, 9), (0.99, 12, 11), (0.01, 12, 1)]
+)
+def test_the_share_is_that_of_the_episodes_but_for_one_on_either_side(fraction, count, held_out):
+    config = CollectConfig(validation_fraction=fraction)
+    dataset = datasets.add(datasets.empty(3, 2), numbered_episodes([2] * count), config, np.random.default_rng(0))
+    assert [len(episodes) for episodes in split_of(dataset)] == [count - held_out, held_out]
+
+
+def test_an_empty_dataset_has_a_column_for_each_thing_to_be_predicted():
+    for learned in (0, 1, 2):
+        nothing = datasets.empty(3, 2, learned)
+        for t in (nothing.train, nothing.validation):
+            assert [x.shape for x in t[:3]] == [(0, 3), (0, 2), (0, 3 + learned)]
+            assert t.size == 0
+
+
 def test_which_episodes_are_held_out_is_drawn():
     drawn = set()
     for seed in range(30):

@@ -39,10 +39,12 @@ def name(page: Path) -> str:
 
 @pytest.fixture
 def workshop(tmp_path, monkeypatch):
-    """An empty directory, the current one, with a run as the pages call it, and the tree's examples and results."""
-    run = ROOT / "results" / "laptop" / "Swimmer" / "me-trpo" / "seed-0"
-    for place in ("runs/Swimmer-fast-seed0", "runs/sweep/Swimmer/me-trpo/seed-0"):
-        shutil.copytree(run, tmp_path / place)
+    """An empty directory, the current one, with runs as the pages call them, and the tree's examples and results."""
+    for place, run in (
+        ("runs/Swimmer-fast-seed0", "laptop/Swimmer/me-trpo/seed-0"),
+        ("runs/sweep/HalfCheetah/me-trpo/seed-0", "diagnostics/HalfCheetah/me-trpo/seed-0"),
+    ):
+        shutil.copytree(ROOT / "results" / run, tmp_path / place)
     for folder in ("examples", "results"):
         (tmp_path / folder).symlink_to(ROOT / folder)
     monkeypatch.chdir(tmp_path)

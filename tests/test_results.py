@@ -1,5 +1,6 @@
 """What the README claims is what the committed runs show."""
 
+import csv
 import json
 import runpy
 from pathlib import Path
@@ -58,3 +59,14 @@ def test_the_performance_table_is_the_recorded_one():
     recorded = json.loads((ROOT / "results" / "performance" / "bench.json").read_text())
     text = Report.of(recorded).text()
     assert text in (ROOT / "docs" / "performance.md").read_text(), "paste what Report.of(bench.json).text() gives"
+
+
+def test_of_every_mutant_that_survived_it_is_said_why():
+    out = ROOT / "results" / "mutation"
+    tables = {path.stem: list(csv.DictReader(path.read_text().splitlines())) for path in out.glob("*.csv")}
+    explained = {(row["module"], row["before"], row["after"]) for row in tables.pop("equivalent") if row["why"]}
+    assert len(tables) == 5
+    for module, rows in tables.items():
+        for row in rows:
+            known = (module, row["before"], row["after"]) in explained
+            assert row["outcome"] in ("killed", "timeout") or known, f"{module}, line {row['line']}: {row['after']}"

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from helpers import on_host, random_policy, slow_mean
 from metrpo.config import TRPOConfig
-from metrpo.policy import gaussian, trpo
+from metrpo.policy import gaussian, linearised, trpo
 from metrpo.policy.batch import Batch
 from metrpo.policy.linearised import chunked, linearise
 
@@ -62,6 +62,20 @@ def dense_fisher(policy, states, mask):
         return jnp.sum(mask * divergence) / jnp.sum(mask)
 
     return np.asarray(jax.jit(jax.hessian(mean_kl))(flat), np.float64)
+
+
+def surrogate_gradient(policy, batch):
+    """The surrogate's gradient at the policy itself, by automatic differentiation."""
+    flat, unravel = ravel_pytree(policy)
+
+    def surrogate(parameters):
+        p = unravel(parameters)
+        means = gaussian.mean(p, jnp.asarray(batch.states))
+        log_probability = gaussian.log_probability(means, p.log_std, batch.actions)
+        weights = batch.mask * batch.advantages / batch.mask.sum()
+        return jnp.sum(weights * jnp.exp(log_probability - jax.lax.stop_gradient(log_probability)))
+
+    return np.asarray(jax.jit(jax.grad(surrogate))(flat), np.float64)
 
 
 @pytest.mark.parametrize(("hidden", "damping"), [((), 0.0), ((5,), 0.1), ((5, 3), 1e-5)])
@@ -122,17 +136,8 @@ def test_the_step_is_the_natural_gradient_of_length_max_kl():
     batch = a_batch(12, policy)
     config = TRPOConfig(max_kl=1e-3, cg_iterations=60, damping=0.05)
     new, info = improve(policy, batch, config)
-    flat, unravel = ravel_pytree(policy)
-
-    def surrogate(parameters):
-        p = unravel(parameters)
-        log_probability = gaussian.log_probability(
-            gaussian.mean(p, jnp.asarray(batch.states)), p.log_std, batch.actions
-        )
-        weights = batch.mask * batch.advantages / batch.mask.sum()
-        return jnp.sum(weights * jnp.exp(log_probability - jax.lax.stop_gradient(log_probability)))
-
-    gradient = np.asarray(jax.jit(jax.grad(surrogate))(flat), np.float64)
+    flat, _ = ravel_pytree(policy)
+    gradient = surrogate_gradient(policy, batch)
     fisher = dense_fisher(policy, batch.states, batch.mask) + 0.05 * np.eye(flat.size)
     x = np.linalg.solve(fisher, gradient)
     full = x * np.sqrt(2 * config.max_kl / (x @ fisher @ x))
@@ -210,6 +215,90 @@ def test_the_line_search_gives_up_after_its_tries():
     assert not np.array_equal(many.log_std, policy.log_std)
 
 
+def test_every_try_of_the_line_search_counts():
+    """Where the first n tries fail, n + 1 are enough and n are not."""
+    policy = random_policy(0, hidden=(5,))
+    batch = a_batch(1, policy)
+    failing = int(improve(policy, batch, TRPOConfig(max_kl=50.0, max_backtracks=60))[1].backtracks)
+    for tries in (failing, failing + 1):
+        info = improve(policy, batch, TRPOConfig(max_kl=50.0, max_backtracks=tries))[1]
+        assert (info.accepted, info.backtracks) == (tries > failing, tries - 1)
+
+
+def test_the_first_try_that_passes_is_taken():
+    """Against a line search in NumPy along the same step."""
+    found = set()
+    for seed in range(8):
+        policy, config = random_policy(seed, hidden=(5,)), TRPOConfig(max_kl=0.5)
+        batch = a_batch(seed + 1, policy)
+        new, info = improve(policy, batch, config)
+        flat, unravel = ravel_pytree(policy)
+        full = (ravel_pytree(new)[0] - flat) / 0.8**info.backtracks
+        start, _ = slow_surrogate_and_kl(policy, policy, batch)
+        tries = [
+            slow_surrogate_and_kl(policy, unravel(flat + 0.8**i * full), batch) for i in range(info.backtracks + 1)
+        ]
+        passes = [gain > start and divergence <= config.max_kl for gain, divergence in tries]
+        assert passes == [False] * int(info.backtracks) + [True]
+        found.add(int(info.backtracks))
+    assert found >= {0, 1, 2, 3}
+
+
+def test_a_gain_that_overflows_is_none():
+    """One action lies so far out that its ratio is infinite after any step, though the policy moves by max_kl only."""
+    policy = gaussian.Policy(((np.zeros((1, 1), np.float32), np.zeros(1, np.float32)),), np.zeros(1, np.float32))
+    actions = np.array([[1e6], [1.0], [-1.0], [0.5]], np.float32)
+    advantages = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
+    batch = Batch(np.zeros((4, 1), np.float32), actions, advantages, np.ones(4, np.float32))
+    new, info = improve(policy, batch, CONFIG)
+    assert np.isfinite(info.cg_residual), "it must be the gain that is not finite"
+    assert not info.accepted
+    assert (info.kl, info.improvement) == (0, 0)
+    assert jax.tree.all(jax.tree.map(np.array_equal, new, policy))
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_after_one_iteration_residual_and_step_are_those_of_steepest_descent(size):
+    """x = a g: residual |g - a F g| / |g|, and a step as long as F says, whatever the unit of the advantages."""
+    policy = random_policy(11, hidden=(3,))
+    batch = a_batch(12, policy)
+    batch = batch._replace(advantages=(size * batch.advantages).astype(np.float32))
+    gradient = surrogate_gradient(policy, batch)
+    image = (dense_fisher(policy, batch.states, batch.mask) + 0.05 * np.eye(gradient.size)) @ gradient
+    left = gradient - image * (gradient @ gradient) / (gradient @ image)
+    config = TRPOConfig(max_kl=1e-3, cg_iterations=1, damping=0.05)
+    new, info = improve(policy, batch, config)
+    assert info.accepted
+    assert float(info.cg_residual) == pytest.approx(np.linalg.norm(left) / np.linalg.norm(gradient), rel=1e-3)
+    full = gradient * np.sqrt(2 * config.max_kl / (gradient @ image))
+    step = ravel_pytree(new)[0] - ravel_pytree(policy)[0]
+    np.testing.assert_allclose(step, full * 0.8 ** int(info.backtracks), atol=2e-3 * np.abs(full).max())
+
+
+def test_a_single_step_says_what_it_says_twice():
+    """Means over the steps that count, be it one."""
+    policy = random_policy(3, hidden=(5,))
+    batch = a_batch(4, policy, 1.0)
+    twice = Batch(*(x[[0, 0]] for x in batch))
+    once = Batch(*(x[:2] for x in batch))._replace(mask=np.array([1, 0], np.float32))
+    config = TRPOConfig(damping=0.1)
+    assert improve(policy, once, config)[1].accepted
+    for ours, theirs in zip(*(jax.tree.leaves(improve(policy, b, config)) for b in (once, twice)), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_a_batch_in_chunks_says_what_it_says_whole(monkeypatch):
+    """24 steps at once, and as two chunks of 10 and a padded one; few iterations, for they magnify rounding."""
+    policy, config = random_policy(3, hidden=(5,)), TRPOConfig(damping=0.1, cg_iterations=1)
+    batch = a_batch(4, policy)
+    whole = improve(policy, batch, config)
+    monkeypatch.setattr(linearised, "CHUNK", 10)
+    in_chunks = on_host()(lambda policy, batch: trpo.improve(policy, batch, config))(policy, batch)
+    assert in_chunks[1].accepted
+    for ours, theirs in zip(jax.tree.leaves(in_chunks), jax.tree.leaves(whole), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-5)
+
+
 @pytest.mark.parametrize("poison", ["advantages", "actions", "states"])
 def test_nan_leaves_the_policy_as_it_is(poison):
     policy = random_policy(0, hidden=(5,))
@@ -228,6 +317,7 @@ def test_a_batch_that_says_nothing_leaves_the_policy_as_it_is(nothing):
     getattr(batch, nothing)[:] = 0
     new, info = improve(policy, batch, CONFIG)
     assert not info.accepted
+    assert (info.kl, info.improvement, info.cg_residual) == (0, 0, 0)
     assert jax.tree.all(jax.tree.map(np.array_equal, new, policy))
 
 
@@ -255,26 +345,20 @@ def test_masked_steps_have_no_influence():
         np.testing.assert_allclose(ours, theirs, atol=1e-4)
 
 
-def test_every_nth_step_makes_the_fisher_matrix_and_all_steps_the_rest():
-    """Against a dense solve with the Fisher matrix of every third step and the gradient of all of them."""
+@pytest.mark.parametrize("every", [2, 3])
+def test_every_nth_step_makes_the_fisher_matrix_and_all_steps_the_rest(every):
+    """Against a dense solve with the Fisher matrix of every n-th step and the gradient of all of them."""
     policy = random_policy(5, hidden=(3,))
     batch = a_batch(6, policy)
-    config = TRPOConfig(max_kl=1e-3, cg_iterations=60, damping=0.05, fisher_every=3)
+    config = TRPOConfig(max_kl=1e-3, cg_iterations=60, damping=0.05, fisher_every=every)
     new, info = improve(policy, batch, config)
-    flat, unravel = ravel_pytree(policy)
-
-    def surrogate(parameters):
-        p = unravel(parameters)
-        means = gaussian.mean(p, jnp.asarray(batch.states))
-        log_probability = gaussian.log_probability(means, p.log_std, batch.actions)
-        return jnp.sum(batch.mask * batch.advantages / batch.mask.sum() * log_probability)
-
-    gradient = np.asarray(jax.jit(jax.grad(surrogate))(flat), np.float64)
-    fisher = dense_fisher(policy, batch.states[::3], batch.mask[::3]) + 0.05 * np.eye(flat.size)
+    flat, _ = ravel_pytree(policy)
+    gradient = surrogate_gradient(policy, batch)
+    fisher = dense_fisher(policy, batch.states[::every], batch.mask[::every]) + 0.05 * np.eye(flat.size)
     x = np.linalg.solve(fisher, gradient)
     full = x * np.sqrt(2 * config.max_kl / (x @ fisher @ x))
     step = np.asarray(ravel_pytree(new)[0], np.float64) - np.asarray(flat, np.float64)
     assert info.accepted
     np.testing.assert_allclose(step, full * 0.8 ** int(info.backtracks), atol=2e-3 * np.abs(full).max())
-    every, _ = improve(policy, batch, TRPOConfig(max_kl=1e-3, cg_iterations=60, damping=0.05))
-    assert not np.allclose(ravel_pytree(every)[0] - flat, step, atol=1e-2 * np.abs(full).max())
+    of_all, _ = improve(policy, batch, TRPOConfig(max_kl=1e-3, cg_iterations=60, damping=0.05))
+    assert not np.allclose(ravel_pytree(of_all)[0] - flat, step, atol=1e-2 * np.abs(full).max())
