@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import os
 import signal
@@ -16,7 +17,7 @@ import pytest
 
 from metrpo import cli, options
 from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError
-from metrpo.experiments import on_node, on_ray
+from metrpo.experiments import on_node, on_ray, sent
 from metrpo.experiments.figures import Run
 from metrpo.experiments.means import Backend, Means
 from metrpo.experiments.on_node import Ended, Order
@@ -26,7 +27,8 @@ from metrpo.run.interrupt import Stopped
 
 RUNS = [Run("Swimmer", "k-1", seed, (("iterations", 3),), "fast") for seed in range(4)]
 ROW = {"iteration": 3, "real_steps": 30, "return_real": 1.5}
-MEANS = Means("ray", jobs=2, cpus=3, gpus=0.5, address="auto")
+MEANS = Means("ray", jobs=2, cpus=3, gpus=0.5, address="auto", storage="sent")
+SHARED = dataclasses.replace(MEANS, storage="shared")
 
 
 # ---------------------------------------------------------------- options and table
@@ -40,8 +42,9 @@ def test_every_backend_stands_in_the_table_with_the_same_signature():
 @pytest.mark.parametrize("command", [["sweep"], ["reproduce", "all"]])
 def test_options(command):
     typed = ["--backend", "ray", "--jobs", "2", "--cpus", "3", "--gpus", "0.5", "--address", "auto"]
+    typed += ["--storage", "sent"]
     assert options.parse([*command, *typed]).means == MEANS
-    assert options.parse(command).means == Means("local", None, None, 0.0, None)
+    assert options.parse(command).means == Means("local", None, None, 0.0, None, "shared")
 
 
 @pytest.mark.parametrize(
@@ -51,6 +54,7 @@ def test_options(command):
         ({"cpus": 0}, "cpus: expected at least 1, got 0"),
         ({"gpus": 1.0}, "gpus: only --backend ray knows it"),
         ({"address": "here:1"}, "address: only --backend ray knows it"),
+        ({"storage": "sent"}, "storage: only --backend ray knows it; add that, or leave --storage out"),
         ({"backend": "ray", "gpus": 1.5}, "gpus: expected a whole number or a part of 1, got 1.5"),
         ({"backend": "ray", "gpus": -1.0}, "gpus: expected a whole number"),
         ({"backend": "ray", "gpus": float("nan")}, "gpus: expected a whole number"),
@@ -91,7 +95,7 @@ class FakeRay:
 
     def __init__(self, outcomes, at_wait=lambda: None, stubborn=False):
         self.outcomes, self.at_wait, self.stubborn = outcomes, at_wait, stubborn
-        self.asked, self.orders, self.cancelled, self.most = None, [], [], 0
+        self.asked, self.function, self.orders, self.cancelled, self.most = None, None, [], [], 0
         self.on = False
 
     def init(self, **how):
@@ -106,8 +110,8 @@ class FakeRay:
         self.asked = asked
 
         def decorate(function):
-            assert function is on_node.attend
-            return SimpleNamespace(remote=lambda order: self.orders.append(order) or len(self.orders) - 1)
+            self.function = function
+            return SimpleNamespace(remote=lambda *order: self.orders.append(order) or len(self.orders) - 1)
 
         return decorate
 
@@ -123,7 +127,8 @@ class FakeRay:
             raise self.outcomes[ref]
         return self.outcomes[ref]
 
-    def cancel(self, ref, force=False):
+    def cancel(self, ref, force=False, recursive=True):
+        assert force or not recursive, "a task that is asked to stop still sends what it has"
         self.cancelled.append((ref, force))
 
     def nodes(self):
@@ -144,7 +149,7 @@ def on(monkeypatch, tmp_path):
     handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
 
-    def run(ray, means=MEANS):
+    def run(ray, means=SHARED):
         monkeypatch.setitem(sys.modules, "ray", ray)
         told = []
         try:
@@ -168,7 +173,8 @@ def test_what_is_asked_of_ray(on, monkeypatch, tmp_path):
     assert ray.asked["max_retries"] == on_ray.RETRIES
     assert ray.asked["retry_exceptions"] is False
     assert ray.most == 2, "jobs"
-    order = ray.orders[1]
+    assert ray.function is on_node.attend
+    (order,) = ray.orders[1]
     directory = str(tmp_path / RUNS[1].name)
     assert order.words == ("train", *RUNS[1].arguments, "--run-dir", directory, "--no-video")
     assert (order.directory, order.log, order.folder) == (directory, f"{directory}.log", os.getcwd())
@@ -181,6 +187,16 @@ def test_what_is_asked_of_ray(on, monkeypatch, tmp_path):
     ray = FakeRay([Ended(0, (ROW,), 7.0)] * 4)
     on(ray, Means("ray"))
     assert (ray.asked["num_cpus"], ray.asked["num_gpus"], ray.most) == (1, 0.0, 4)
+
+
+def test_what_is_asked_of_machines_that_share_no_disk(on, monkeypatch, tmp_path):
+    monkeypatch.setattr(on_ray.sent, "start_store", lambda ray, out: f"the store of {out}")
+    ray = FakeRay([Ended(0, (ROW,), 7.0)] * 4)
+    failed, _ = on(ray, MEANS)
+    assert failed == []
+    assert ray.function is sent.attend_for
+    order, name, store = ray.orders[2]
+    assert (order.directory, name, store) == (str(tmp_path / name), RUNS[2].name, f"the store of {tmp_path}")
 
 
 def test_a_run_that_fails_stops_no_other_and_is_told_with_the_reason(on, tmp_path):
@@ -303,7 +319,7 @@ def test_a_task_that_is_cancelled_asks_its_run_to_stop(monkeypatch):
         sleep(seconds)
 
     monkeypatch.setattr(on_node.time, "sleep", interrupted)
-    assert on_node._wait(process) == -signal.SIGTERM
+    assert on_node._wait(process, lambda: None) == -signal.SIGTERM
 
 
 def test_a_directory_that_is_held_is_waited_for(tmp_path, monkeypatch):

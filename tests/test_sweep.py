@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 
 import pytest
 
 from metrpo import cli, options
 from metrpo.config import Config
 from metrpo.errors import ConfigError, TaskError
-from metrpo.experiments import reproduce
+from metrpo.experiments import reproduce, sweep
 from metrpo.experiments.means import Means
 from metrpo.experiments.sweep import Grid, from_file, seeds_of, values_of
 from metrpo.run import machine
@@ -31,6 +32,36 @@ def test_every_combination_is_a_run_of_its_own():
     c = runs[-1].config
     assert (c.task, c.system, c.seed, c.ensemble.members) == ("mbbl/Pendulum", "k-1", 1, 1)
     assert (c.trpo.max_kl, c.ensemble.hidden, c.deterministic) == (0.05, (16, 16), True)
+
+
+def test_a_combination_with_a_long_name_has_a_folder_that_every_disk_takes(tmp_path):
+    many = {
+        "ensemble.members": [2],
+        "ensemble.hidden": [[256, 256, 256]],
+        "fit.max_passes": [100],
+        "imagine.steps": [50000],
+        "imagine.horizon": [100],
+        "validate.max_updates": [40],
+        "validate.patience": [25],
+        "collect.steps": [4000],
+        "trpo.max_kl": [0.01],
+        "trpo.cg_iterations": [10],
+        "policy.hidden": [[32, 32]],
+        "advantage.discount": [0.99, 0.999],
+    }
+    runs = Grid(("Swimmer",), seeds=(0,), settings=many).runs()
+    words = "me-trpo," + ",".join(
+        f"{n}={'x'.join(map(str, v[0])) if isinstance(v[0], list) else v[0]}" for n, v in many.items()
+    )
+    assert len(words) > 255
+    folders = [run.name.split("/")[1] for run in runs]
+    assert folders[0] == words[:180] + "," + hashlib.sha256(words.encode()).hexdigest()[:16]
+    assert folders[1].startswith(words[:180])
+    assert len(set(folders)) == 2, "what is cut off still counts"
+    for run in runs:
+        (tmp_path / run.name).mkdir(parents=True)
+    assert sweep._variant("k-1", (("a", "é" * 124 + "b"),)) == "k-1,a=" + "é" * 124 + "b", "255 bytes"
+    assert sweep._variant("k-10", (("a", "é" * 125),)).startswith("k-10,a=" + "é" * 86 + ","), "no half letters"
 
 
 def test_what_is_run_is_what_the_grid_says(monkeypatch):

@@ -1,16 +1,22 @@
-"""A Ray cluster of three nodes on one machine: one is lost, the driver is killed, and nothing is missing in the end."""
+"""A Ray cluster of three nodes on one machine: one is lost, the driver is killed, and nothing is missing in the end.
+
+With the folder of the runs shared, and with every node in a folder of its own.
+"""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from metrpo import read_metrics
+from metrpo.errors import RunDirectoryError
 from metrpo.experiments.standing import words
 from metrpo.experiments.sweep import Grid, values_of
 
@@ -72,22 +78,22 @@ def runs():
     return Grid((CART,), seeds=tuple(range(RUNS + 1)), settings=settings).runs()
 
 
-def sweep(cluster, out):
+def sweep(cluster, out, *more, seeds=f"0:{RUNS + 1}", environment=SLOW):
     grid = [f"{name}={value}" for name, value in TINY.items()]
-    command = ["sweep", "--tasks", CART, "--seeds", f"0:{RUNS + 1}", "--set", *grid, "--out", str(out)]
+    command = ["sweep", "--tasks", CART, "--seeds", seeds, "--set", *grid, "--out", str(out)]
     return subprocess.Popen(
-        [sys.executable, "-m", "metrpo", *command, "--backend", "ray", "--address", cluster.address],
+        [sys.executable, "-m", "metrpo", *command, "--backend", "ray", "--address", cluster.address, *more],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        env=SLOW,
+        env=environment,
     )
 
 
-@pytest.fixture
-def alone(tmp_path):
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
     """The runs one after the other, in a process that does nothing else."""
-    out = tmp_path / "alone"
+    out = tmp_path_factory.mktemp("alone")
     lines = "\n".join("\t".join(words(run, out / run.name)) for run in runs() if run.seed != FAILS)
     command = [sys.executable, "-c", ALONE]
     subprocess.run(command, input=lines, text=True, check=True, stdout=subprocess.DEVNULL, env=ENVIRONMENT)
@@ -144,4 +150,92 @@ def test_a_lost_node_and_a_killed_driver_cost_nothing(alone, cluster, tmp_path):
     assert begun_again(out) >= 3, "that of the lost node, one that was under way when the driver died, the failing one"
     for run in everything:
         for name in DERIVED if run.seed != FAILS else ():
+            assert (out / run.name / name).read_bytes() == (alone / run.name / name).read_bytes(), f"{run.name}: {name}"
+
+
+SEEDS = (0, 1, 2, 4)
+"""Of the runs that are sent; three are under way at the same time."""
+
+
+def processes():
+    """The runs' own: process id -> its words."""
+    found = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with suppress(OSError):
+            line = (folder / "cmdline").read_text().split("\0")
+            if "metrpo.experiments.tied" in line and CART in line:
+                found[int(folder.name)] = line
+    return found
+
+
+def opened(pid):
+    """What a process has open, and its working directory."""
+    found = []
+    for link in [*Path(f"/proc/{pid}/fd").glob("*"), Path(f"/proc/{pid}/cwd")]:
+        with suppress(OSError):
+            found.append(os.readlink(link))
+    return found
+
+
+def parent(pid):
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
+
+
+def run_dir(line):
+    return Path(line[line.index("--run-dir") + 1])
+
+
+def node_and_seed_to_lose(cluster, out):
+    """A node but the driver's whose run has finished an iteration and not all, with the run's seed; or None."""
+    raylets = {node.all_processes["raylet"][0].process.pid: node for node in cluster.worker_nodes}
+    for pid, line in processes().items():
+        directory = run_dir(line)
+        with suppress(OSError, RunDirectoryError):  # it has ended, or its first iteration has not
+            node = raylets.get(parent(parent(pid)))
+            rows = len(read_metrics(out.joinpath(*directory.parts[-3:], "metrics.csv")))
+            if node is not None and 0 < rows < ITERATIONS:
+                return node, int(directory.name.removeprefix("seed-"))
+    return None
+
+
+@pytest.mark.skipif(not Path("/proc/self/fd").exists(), reason="looks at other processes by Linux's /proc")
+def test_nodes_that_share_no_disk_work_in_folders_of_their_own(alone, cluster, tmp_path):
+    out, seen, touched, lost = tmp_path / "out", {}, set(), []
+
+    def look():
+        for pid, line in processes().items():
+            seen[pid] = line
+            touched.update(path for path in opened(pid) if path.startswith(str(out)))
+
+    def a_run_has_something_to_lose():
+        look()
+        lost[:] = [node_and_seed_to_lose(cluster, out)]
+        return lost[0] is not None
+
+    seeds, slow = ",".join(map(str, SEEDS)), SLOW | {"METRPO_TEST_STEP_SECONDS": "0.2"}
+    driver = sweep(cluster, out, "--storage", "sent", seeds=seeds, environment=slow)
+    wait_for(driver, a_run_has_something_to_lose)
+    node, seed = lost[0]
+    cluster.remove_node(node, allow_graceful=False)
+    while driver.poll() is None:
+        look()
+        time.sleep(0.1)
+    text = driver.communicate()[0]
+    assert driver.returncode == 0, text
+
+    folders = [run_dir(line) for line in seen.values()]
+    for folder in folders:
+        shutil.rmtree(folder.parents[2], ignore_errors=True)  # the lost node has left its own
+    assert len(set(folders)) == len(folders) == len(SEEDS) + 1, "each in one of its own, and one more for the lost one"
+    assert not [word for line in seen.values() for word in line if str(out) in word]
+    assert touched == set()
+    chosen = [run for run in runs() if run.seed in SEEDS]
+    (again,) = (run for run in chosen if run.seed == seed)
+    log = (out / f"{again.name}.log").read_text()
+    assert log.count("metrpo: on ") == 2
+    assert log.count(f"iteration 1/{ITERATIONS} ") == log.split("metrpo: on ")[1].count(f"iteration 1/{ITERATIONS} "), (
+        "it went on from what had come back"
+    )
+    for run in chosen:
+        for name in DERIVED:
             assert (out / run.name / name).read_bytes() == (alone / run.name / name).read_bytes(), f"{run.name}: {name}"

@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,7 +35,7 @@ FORWARDED = (
 """How the names of the environment variables begin that a run depends on; Ray hands on none by itself."""
 _POLL = 0.2
 """Seconds between two looks at the process."""
-_PATIENCE = 300.0
+PATIENCE = 300.0
 """Seconds to wait for a run directory that another process holds: a machine that has lost its cluster takes a minute to
 notice, and then ends its run."""
 
@@ -89,9 +89,10 @@ def surroundings(order: Order, here: Mapping[str, str]) -> dict[str, str]:
     return found
 
 
-def attend(order: Order) -> Ended:
+def attend(order: Order, look: Callable[[], None] = lambda: None) -> Ended:
     """Runs it to its end, on from its last checkpoint; asked to stop (by Ray's KeyboardInterrupt), it asks the run.
 
+    Meanwhile `look` is called again and again, and once more after the end; when that raises, the run is killed.
     Raises `MetrpoError` when this machine cannot: a folder is not there, or another process holds the run.
     """
     began, node = time.monotonic(), os.uname().nodename
@@ -100,7 +101,7 @@ def attend(order: Order) -> Ended:
     directory = Path(order.directory)
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        wait_until_free(directory, _PATIENCE)
+        wait_until_free(directory, PATIENCE)
         log = os.open(order.log, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     except OSError as error:
         raise MetrpoError(f"{node}: cannot write {directory}: {error.strerror or error}") from error
@@ -114,18 +115,27 @@ def attend(order: Order) -> Ended:
         start_new_session=True,
     )
     os.close(log)  # the process has its own
-    code = _wait(process)
+    code = _wait(process, look)
     return Ended(code, _last_row(directory), time.monotonic() - began)
 
 
-def _wait(process: subprocess.Popen[bytes]) -> int:
+def _wait(process: subprocess.Popen[bytes], look: Callable[[], None]) -> int:
     # Python's own wait would not hear Ray's KeyboardInterrupt, which is no signal.
-    while process.poll() is None:
+    code, looked = None, False
+    while code is None or not looked:
+        code, looked = process.poll(), False
         try:
-            time.sleep(_POLL)
+            look()
+            looked = True
+            if code is None:
+                time.sleep(_POLL)
+        except Exception:
+            process.kill()
+            process.wait()
+            raise
         except BaseException:
             process.terminate()
-    return process.returncode
+    return code
 
 
 def _last_row(directory: Path) -> tuple[Row, ...]:

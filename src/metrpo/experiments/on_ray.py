@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from metrpo.errors import MetrpoError
-from metrpo.experiments import on_node
+from metrpo.experiments import on_node, sent
 from metrpo.experiments.figures import Run
 from metrpo.experiments.means import Means
 from metrpo.experiments.standing import Tell, has_spent, log_of, tail, tell_failure, tell_success, words
@@ -34,8 +34,9 @@ _REPORT = 60.0
 
 
 def run_on_ray(runs: list[Run], out: Path, means: Means, tell: Tell) -> list[Run]:
-    """Runs all on a Ray cluster whose machines share `out`, and returns those that failed (see `reproduce`).
+    """Runs all on a Ray cluster and returns those that failed (see `reproduce`).
 
+    Its machines share `out`, or each works in a folder of its own and sends `out` what changes (`means.storage`).
     Raises `MetrpoError` when Ray is not installed or its cluster cannot be reached.
     """
     environment = on_node.forwarded(os.environ)
@@ -48,13 +49,15 @@ def run_on_ray(runs: list[Run], out: Path, means: Means, tell: Tell) -> list[Run
             max_retries=RETRIES,
             retry_exceptions=False,
             scheduling_strategy="SPREAD",
-        )(on_node.attend)
+        )(on_node.attend if means.storage == "shared" else sent.attend_for)
+        store = None if means.storage == "shared" else sent.start_store(ray, out.absolute())
         waiting, failed, reported = list(runs), list[Run](), time.monotonic()
         under_way: dict[Any, Run] = {}
         while (waiting or under_way) and not heard:
             while waiting and len(under_way) < (means.jobs or len(runs)):
                 run = waiting.pop(0)
-                under_way[task.remote(_order(run, out.absolute(), means, environment))] = run
+                order = _order(run, out.absolute(), means, environment)
+                under_way[task.remote(order, run.name, store) if store else task.remote(order)] = run
             time.sleep(_POLL)
             for ref in _ended(ray, list(under_way)):
                 run = under_way.pop(ref)
@@ -91,7 +94,8 @@ def _connected(ray: Any, address: str | None) -> Iterator[None]:
     except (OSError, RuntimeError, ValueError) as error:
         raise MetrpoError(
             f"cannot reach the Ray cluster {address or os.environ.get('RAY_ADDRESS', '')} "
-            f"({str(error).splitlines()[0]}); start one with: ray start --head"
+            f"({str(error).splitlines()[0]}); start one with: ray start --head; if one is there and says "
+            "InvalidAuthToken: export RAY_AUTH_MODE=token"
         ) from error
     try:
         yield
@@ -149,7 +153,7 @@ def _stop(ray: Any, refs: list[Any], heard: list[int], tell: Tell) -> None:
     """Ends the runs and raises `Stopped`: asked once, each finishes its iteration; asked once more, they are killed."""
     tell("stopping the runs after their iteration; once more stops them at once")
     for ref in refs:
-        ray.cancel(ref)
+        ray.cancel(ref, recursive=False)  # what it is sending to the store is to arrive
     while refs and len(heard) == 1:
         time.sleep(_POLL)
         ended = _ended(ray, refs)

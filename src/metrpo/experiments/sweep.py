@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
 import tomllib
@@ -14,6 +15,9 @@ from metrpo.config import Preset, System
 from metrpo.errors import ConfigError
 from metrpo.experiments.figures import Run
 from metrpo.world.registry import get_task
+
+_LONGEST, _KEPT = 255, 180
+"""Bytes that a folder's name may have on common disks, and how many of a longer one stay readable."""
 
 
 @dataclass(frozen=True)
@@ -118,9 +122,12 @@ def _hashable(value: Any) -> Any:
 
 
 def _variant(system: str, overrides: tuple[tuple[str, Any], ...]) -> str:
-    """The folder of a combination, in words: "me-trpo,ensemble.members=5"."""
+    """The folder of a combination, in words: "me-trpo,ensemble.members=5"; a hash stands for the end of a long one."""
 
     def word(value: Any) -> str:
         return "x".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
-    return ",".join([system, *(f"{name}={word(value)}" for name, value in overrides)]).replace("/", "-")
+    name = ",".join([system, *(f"{name}={word(value)}" for name, value in overrides)]).replace("/", "-")
+    if len(encoded := name.encode()) <= _LONGEST:
+        return name
+    return f"{encoded[:_KEPT].decode(errors='ignore')},{hashlib.sha256(encoded).hexdigest()[:16]}"
