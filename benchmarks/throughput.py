@@ -22,7 +22,7 @@ from pathlib import Path
 from metrpo.run.files import source_commit
 from metrpo.run.machine import cores
 
-GRID = ["--tasks", "Swimmer", "--seeds", "0:4", "--set", "iterations=2"]
+GRID = ["--tasks", "Swimmer", "--seeds", "0:4", "--set", "iterations=1"]
 
 
 def seconds(jobs: int) -> float:
