@@ -290,13 +290,15 @@ def test_the_environment_is_ready_before_jax(monkeypatch, tmp_path):
     assert os.environ["JAX_PLATFORMS"] == "cpu"
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == str(tmp_path / "metrpo" / "jax")
     cores = len(os.sched_getaffinity(0))
-    assert os.environ["XLA_FLAGS"] == f"--xla_force_host_platform_device_count={min(cores, 8)}"
+    patient = " ".join(machine.PATIENT)
+    assert os.environ["XLA_FLAGS"] == f"--xla_force_host_platform_device_count={min(cores, 8)} {patient}"
     machine.prepare(None, deterministic=False)
-    assert os.environ["XLA_FLAGS"].count("device_count") == 1
+    assert [os.environ["XLA_FLAGS"].count(f) for f in ("device_count", "terminate_timeout")] == [1, 1]
     monkeypatch.setenv("XLA_FLAGS", "--xla_mine=1")
     monkeypatch.setenv("JAX_PLATFORMS", "tpu")
     machine.prepare(None, deterministic=True)
     flags = "--xla_mine=1 --xla_force_host_platform_device_count=1 --xla_cpu_multi_thread_eigen=false"
+    flags += f" {patient}"
     assert os.environ["XLA_FLAGS"] == flags
     assert (os.environ["JAX_PLATFORMS"], os.environ["NPROC"]) == ("tpu", "1")
     machine.prepare("cpu", deterministic=False)

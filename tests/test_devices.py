@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from functools import partial
 from jax.sharding import PartitionSpec as P
 from helpers import random_ensemble, random_policy
+from metrpo.policy import gaussian
 from metrpo import devices
 """
 
@@ -88,6 +89,38 @@ assert len(set(noise.tolist())) == noise.size, "two devices drew the same noise"
 np.savez(OUT, np.zeros(1))
 """
 
+WIDE = """
+from metrpo import devices
+from metrpo.model import imagine as module
+from metrpo.types import Trajectories
+module.CORE_CACHE = 100  # bytes; the largest layer has 1,024
+module.FEW_ROWS = FEW
+ensemble = random_ensemble(members=3, scale=0.3, hidden=(16, 16))
+policy = random_policy(0, 4, 2, hidden=(8,))
+starts = np.random.default_rng(1).normal(size=(12, 4)).astype(np.float32)
+mesh = devices.mesh(12, "rollouts")
+second, first = P(None, "rollouts"), P("rollouts")
+
+def work(policy, starts):
+    def total(policy):
+        act = lambda states, key: gaussian.sample(policy, states, key)
+        reward = lambda s, a, n: n[:, 0] - a[:, 1]
+        t, info = module.imagine(
+            ensemble, act, reward, lambda n: n[:, 0] > 1.5, starts, 5, jax.random.key(0), SAMPLING, "rollouts"
+        )
+        return jnp.sum(t.rewards * t.mask), (t, info)
+
+    gradient, found = jax.grad(total, has_aux=True)(policy)
+    return *found, jax.lax.psum(gradient, "rollouts")
+
+share = Trajectories(second, second, second, second, last=first, going_on=first)
+specs = {"in_specs": (P(), P("rollouts")), "out_specs": (share, P(), P())}
+out = jax.jit(jax.shard_map(work, mesh=mesh, check_vma=False, **specs))(policy, starts)
+assert 0 < float(out[1].steps) < 60, "some rollouts ended"
+np.savez(OUT, *jax.tree.leaves(out))
+"""
+"""Rollouts and the gradient of their return, with models that are too wide for one core: FEW_ROWS decides."""
+
 
 def results(code: str, count: int, out: Path) -> list:
     """What `code` saves to OUT in a process with `count` CPU devices."""
@@ -111,6 +144,21 @@ def test_several_devices_find_what_one_finds(code, atol, tmp_path):
 
 def test_each_device_imagines_rollouts_of_its_own(tmp_path):
     results(IMAGINE, 3, tmp_path / "out.npz")
+
+
+@pytest.mark.parametrize(("rows", "sampling"), [(2, "step_rand"), (6, "model_mean")])
+def test_cores_with_few_rows_for_wide_models_work_together(rows, sampling, tmp_path):
+    """Each of two devices has `rows` rows for a model."""
+
+    def found(devices: int, few: int) -> list:
+        code = f"FEW, SAMPLING = {few}, {sampling!r}\n" + WIDE
+        return results(code, devices, tmp_path / f"{devices}-{few}.npz")
+
+    alone, together, apart = found(1, 100), found(2, rows + 1), found(2, rows)
+    for ours, theirs in zip(together, alone, strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-5)
+    actions = 1
+    assert not np.allclose(apart[actions], alone[actions]), "on a device of their own they draw noise of their own"
 
 
 @pytest.mark.parametrize(("count", "available", "size"), [(500, 2, 2), (50, 4, 2), (7, 4, 1), (5, 8, 5), (1, 3, 1)])

@@ -116,20 +116,23 @@ def test_unseen_dimensions_have_no_influence_and_are_predicted_all_the_same():
     np.testing.assert_allclose(normaliser.delta_std, train.deltas.std(0), rtol=1e-4)
 
 
-def test_bfloat16_products_are_the_float32_ones_of_rounded_operands():
-    """The products of bfloat16 numbers are exact in float32, so only the operands' rounding may show."""
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 1e-5), ("bfloat16", 1e-2)])
+def test_products_and_their_gradients_are_those_of_the_operands_as_rounded(dtype, tolerance):
+    """The products of bfloat16 numbers are exact in float32, so only rounding may show: the operands', and that of the
+    gradient, which has the weights' type."""
     rng = np.random.default_rng(0)
     x, weights = rng.normal(size=(3, 7, 5)).astype(np.float32), rng.normal(size=(3, 5, 4)).astype(np.float32)
-    rounded = [np.asarray(jnp.asarray(a, jnp.bfloat16), np.float64) for a in (x, weights)]
-    given = (jnp.asarray(x), jnp.asarray(weights, jnp.bfloat16))
+    rounded = [np.asarray(jnp.asarray(a, dtype), np.float64) for a in (x, weights)]
+    given = (jnp.asarray(x), jnp.asarray(weights, dtype))
     got, pull_back = jax.vjp(ensembles._product, *given)
     assert got.dtype == jnp.float32
     np.testing.assert_allclose(got, np.einsum("kbi,kio->kbo", *rounded), rtol=1e-5, atol=1e-5)
-    slope = jnp.asarray(rng.normal(size=got.shape), jnp.bfloat16).astype(jnp.float32)
+    slope = jnp.asarray(rng.normal(size=got.shape), dtype).astype(jnp.float32)
     to_x, to_weights = pull_back(slope)
+    assert to_weights.dtype == dtype
     np.testing.assert_allclose(to_x, np.einsum("kbo,kio->kbi", slope, rounded[1]), rtol=1e-5, atol=1e-5)
     expected = np.einsum("kbi,kbo->kio", rounded[0], slope)
-    np.testing.assert_allclose(np.asarray(to_weights, np.float32), expected, rtol=1e-2, atol=1e-2)
+    np.testing.assert_allclose(np.asarray(to_weights, np.float32), expected, rtol=tolerance, atol=tolerance)
 
 
 def test_products_in_bfloat16_change_predictions_little_and_float32_ones_not_at_all():

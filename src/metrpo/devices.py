@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -35,3 +37,22 @@ def across(x: Any, axis: str | None) -> Any:
 def share_of(key: Any, axis: str | None) -> Any:
     """A random key of this device's own; the key as it is without an `axis`."""
     return key if axis is None else jax.random.fold_in(key, jax.lax.axis_index(axis))
+
+
+def by_first(work: Callable[[Any], Any], share: Any, axis: str) -> Any:
+    """`work` on the whole batch by the first device alone; the others wait, and have zeros where it has results.
+
+    The devices of a CPU have one pool of threads: the first then works with every core. `share` is this device's part
+    of the batch, along the first axis.
+    """
+    batch = jax.lax.all_gather(share, axis, tiled=True)
+
+    def wait(batch: Any) -> Any:
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(work, batch))
+
+    return jax.lax.cond(jax.lax.axis_index(axis) == 0, work, wait, batch)
+
+
+def dealt(x: Any, axis: str, dimension: int) -> Any:
+    """Every device's part, along `dimension`, of the arrays of `x` that the first device has (see `by_first`)."""
+    return jax.lax.psum_scatter(x, axis, scatter_dimension=dimension, tiled=True)

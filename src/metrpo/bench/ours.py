@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -36,7 +37,7 @@ STATE, ACTION, MEMBERS, BATCH = 18, 6, 5, 1000
 ROLLOUTS, HORIZON = 500, 100
 HIDDEN = {"1024": (1024, 1024), "200x4": (200, 200, 200, 200), "200x2": (200, 200)}
 FIT_STEPS = 5
-"""Training steps that one repetition averages over."""
+"""Minibatches of a pass over the training set; the peers average over as many steps, without a validation."""
 PRODUCTS = 20
 """Matrix products that one repetition of a rate averages over."""
 
@@ -140,10 +141,14 @@ def _operations(width: str) -> float:
 
 
 def _fit(width: str, products: str) -> Work:
-    """One training step of all members: blocks of `fit`, the first of each (it compiles, copies) left out."""
+    """One training step of all members: the second of two blocks of `fit` (the first copies).
+
+    A block is what a run has: five passes and a validation.
+    """
     train, validation = _data(FIT_STEPS * BATCH), _data(BATCH)
-    config = FitConfig(products=products, batch_size=BATCH, validate_every=1, patience=9, max_passes=3)  # type: ignore[arg-type]
-    ensemble, blocks = _ensemble(width), config.max_passes - 1
+    config = FitConfig(products=products, batch_size=BATCH, patience=99)  # type: ignore[arg-type]
+    config = replace(config, max_passes=2 * config.validate_every)
+    ensemble = _ensemble(width)
 
     def steps() -> float:
         stamps: list[float] = []
@@ -153,7 +158,7 @@ def _fit(width: str, products: str) -> Work:
             stamps.append(time.perf_counter())
 
         fit(ensemble.networks, ensemble.normaliser, train, validation, config, jax.random.key(0), stamp)
-        return (stamps[-1] - stamps[0]) / (blocks * FIT_STEPS)
+        return (stamps[1] - stamps[0]) / (config.validate_every * FIT_STEPS)
 
     steps()
     # Forward, and backward to the weights of every layer and to the inputs of every layer but the first.

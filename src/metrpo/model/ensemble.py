@@ -110,25 +110,24 @@ def with_products(networks: Networks, dtype: str) -> Networks:
     return tuple((weights.astype(dtype), biases) for weights, biases in networks)
 
 
-def _product(x: Array, weights: Array) -> Array:
-    """[K, B, I], [K, I, O] -> [K, B, O], float32."""
-    if weights.dtype == jnp.bfloat16:
-        return _bfloat16_product(x, weights)
-    return jnp.einsum("kbi,kio->kbo", x, weights)
-
-
 @jax.custom_vjp
-def _bfloat16_product(x: Array, weights: Array) -> Array:
+def _product(x: Array, weights: Array) -> Array:
+    """[K, B, I], [K, I, O] -> [K, B, O], float32; of bfloat16 operands where the weights are bfloat16."""
     return _forward(x, weights)[0]
 
 
 def _forward(x: Array, weights: Array) -> tuple[Array, tuple[Array, Array]]:
+    if weights.dtype != jnp.bfloat16:
+        return jnp.einsum("kbi,kio->kbo", x, weights), (x, weights)
     x = x.astype(jnp.bfloat16)
     return _member_by_member(x, weights), (x, weights)
 
 
 def _backward(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
     x, weights = saved
+    if weights.dtype != jnp.bfloat16:
+        # JAX's own rule takes g' x and turns it round afterwards; Adam then reads it across its rows, twice.
+        return jnp.einsum("kbo,kio->kbi", gradient, weights), jnp.einsum("kbi,kbo->kio", x, gradient)
     gradient = gradient.astype(jnp.bfloat16)
     # On CPUs x' g takes twice as long unless x' lies in memory as its shape says.
     transposed = jnp.swapaxes(x, 1, 2)
@@ -137,7 +136,7 @@ def _backward(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array
     return to_x, _member_by_member(transposed, gradient).astype(weights.dtype)
 
 
-_bfloat16_product.defvjp(_forward, _backward)
+_product.defvjp(_forward, _backward)
 
 
 def _member_by_member(a: Array, b: Array) -> Array:

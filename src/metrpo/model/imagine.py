@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from metrpo.devices import across, share_of
+from metrpo.devices import across, by_first, dealt, share_of
 from metrpo.model.ensemble import Ensemble, first_member, predict, predict_delta
 from metrpo.types import Act, Array, Trajectories
 
@@ -21,6 +21,11 @@ Terminated = Callable[[Array], Array] | Literal["learned"]
 
 EXPLODED = 1e6
 """A rollout with a state beyond this, or a reward beyond its square, has diverged, as has one that meets NaN."""
+
+CORE_CACHE, FEW_ROWS = 2**21, 100
+"""Where a layer has more bytes of weights than the first, and a core fewer rows for each model than the second, one
+core alone reads more than it computes: the cores of a CPU then work together instead of each on rollouts of its own
+(docs/performance.md, "One JAX device per core")."""
 
 
 class ImagineInfo(NamedTuple):
@@ -160,9 +165,19 @@ def imagine(
     """Imagined episodes of `horizon` steps from `starts` [N, S].
 
     Actions are clipped to [-1, 1] for dynamics and reward, and recorded as drawn. Rewards hold `curiosity` times the
-    models' disagreement. With `axis`, `starts` are this
-    device's share of the batch; the trajectories stay with it, the info is about all (see `metrpo.devices`).
+    models' disagreement. With `axis`, `starts` are this device's share of the batch; the trajectories stay with it, the
+    info is about all (see `metrpo.devices`). A CPU's devices share the work, unless the models are too wide for that:
+    then the first does all of it, with every core.
     """
+    if axis is not None and _for_all_cores(ensemble, starts.shape[0], sampling):
+
+        def whole(starts: Array) -> tuple[Trajectories, ImagineInfo]:
+            return imagine(ensemble, act, reward, terminated, starts, horizon, key, sampling, None, curiosity)
+
+        batch, info = by_first(whole, starts, axis)
+        *steps, last, going_on = batch
+        mine = Trajectories(*dealt(steps, axis, 1), *dealt((last, going_on), axis, 0))
+        return mine, across(info, axis)
     next_state = SAMPLINGS[sampling]
     key = share_of(key, axis)
     episode_key = jax.random.fold_in(key, horizon)
@@ -194,6 +209,13 @@ def imagine(
     )
     info = ImagineInfo(total / jnp.maximum(rollouts - lost, 1), lost / rollouts, steps)
     return trajectories._replace(mask=mask, last=last, going_on=alive * (1.0 - diverged)), info
+
+
+def _for_all_cores(ensemble: Ensemble, rows: int, sampling: str) -> bool:
+    """Whether one core of a CPU with `rows` rollouts is better off helping others (`CORE_CACHE`)."""
+    largest = max(weights[0].nbytes for weights, _ in ensemble.networks)
+    models = ensemble.members if sampling in ("step_rand", "eps_rand") else 1
+    return jax.default_backend() == "cpu" and largest > CORE_CACHE and rows < FEW_ROWS * models
 
 
 def _sound(states: Array, rewards: Array) -> Array:

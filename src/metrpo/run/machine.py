@@ -14,6 +14,13 @@ from metrpo.errors import MetrpoError
 MAX_CPU_DEVICES = 8
 """More would have few rollouts each."""
 
+PATIENT = (
+    "--xla_cpu_collective_call_warn_stuck_timeout_seconds=1000000",
+    "--xla_cpu_collective_call_terminate_timeout_seconds=1000000",
+)
+"""A device of a CPU may wait for another as long as it takes. By itself XLA aborts the process after 40 s, which large
+batches, an overloaded machine or a process stopped for a while (Ctrl-Z) can take."""
+
 INSTALL_GPU = "pip install 'metrpo[gpu]' (NVIDIA, CUDA 12)"
 
 
@@ -36,6 +43,8 @@ def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
         os.environ["OPENBLAS_NUM_THREADS"] = "1"
     elif "xla_force_host_platform_device_count" not in os.environ.get("XLA_FLAGS", ""):
         _add_flags(f"--xla_force_host_platform_device_count={min(cores(), MAX_CPU_DEVICES)}")
+    if "xla_cpu_collective" not in os.environ.get("XLA_FLAGS", ""):
+        _add_flags(*PATIENT)
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
