@@ -30,7 +30,7 @@ test: $(READY)  ## lint, types, import rules and the fast tests
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-logo
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/pytest -n 2 --dist worksteal
 
 test-slow: $(READY)  ## the tests that learn for minutes
 	$(BIN)/pytest -m slow --timeout=1800

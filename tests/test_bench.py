@@ -105,6 +105,7 @@ def test_real_work_runs_and_takes_time(name):
     assert 0 < ours.works()[name]().run() < 60
 
 
+@pytest.mark.slow
 def test_whole_iterations_are_timed_and_their_compilations_counted(monkeypatch):
     small = {
         "iterations": 3,

@@ -106,9 +106,11 @@ def test_what_is_unknown_is_named(arguments, message):
 
 @pytest.mark.parametrize("scale", list(SCALES))
 def test_the_command_of_a_run_is_its_config(scale, monkeypatch):
-    """`metrpo train ...` with these arguments trains exactly this."""
+    """`metrpo train ...` with these arguments trains exactly this; every task once, and every system."""
     monkeypatch.setattr(machine, "prepare", lambda *_: None)
-    for run in runs_of("all", scale, seeds=1):
+    runs = runs_of("all", scale, seeds=1)
+    some = {run.system: run for run in runs} | {run.task: run for run in runs}
+    for run in {run.name: run for run in some.values()}.values():
         parsed = options.parse(["train", *run.arguments])
         assert Config(**{f.name: getattr(parsed, f.name) for f in dataclasses.fields(Config)}) == run.config
 

@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-# Seconds on a free core; a machine that does other work needs longer.
-pytestmark = pytest.mark.timeout(600)
+# Of the fast tests, guarantees/test_kill_anywhere.py kills processes, within single operations.
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
 
 STAGES = ("collect", "fit", "improve", "evaluate")
 TINY = [

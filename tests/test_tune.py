@@ -551,6 +551,7 @@ def test_a_run_that_survived_its_tune_is_watched_stopped_and_taken_over(tmp_path
 
 
 @pytest.mark.timeout(600)  # seconds on a free core; a machine that does other work needs longer
+@pytest.mark.slow
 def test_killed_together_with_its_run_it_goes_on_from_the_checkpoint(tmp_path):
     out, tests = tmp_path / "out", Path(__file__).parent
     fixed = {name: value for name, value in SMALL.items() if name != "iterations"}

@@ -15,7 +15,7 @@ from metrpo.run import machine
 from metrpo.run.metrics import read_metrics
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "tutorial.md"
-FEW = ["--collect.steps", "300", "--imagine.steps", "500", "--validate.max-updates", "5", "--fit.max-steps", "20"]
+FEW = ["--collect.steps", "1500", "--imagine.steps", "500", "--validate.max-updates", "5", "--fit.max-steps", "20"]
 
 
 def blocks(language):
