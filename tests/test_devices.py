@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from metrpo import devices
+from metrpo.run import machine
 
 PREAMBLE = """
 import jax, numpy as np
@@ -130,10 +131,27 @@ np.savez(OUT, np.zeros(1))
 """Rollouts and the gradient of their return, with models too wide for one core: where it has few rows for each, the
 first device does all, as one device would."""
 
+SLEEP = """
+import time
 
-def results(code: str, count: int, out: Path) -> list:
+def work(x):
+    def slowly(x):
+        time.sleep(65)
+        return np.asarray(x)
+
+    return devices.by_first(lambda x: jax.pure_callback(slowly, x, x), x, "rollouts")
+
+mesh = devices.mesh(2, "rollouts")
+x = jnp.arange(2.0)
+shared = lambda x: devices.dealt(work(x), "rollouts", 0)
+out = jax.jit(jax.shard_map(shared, mesh=mesh, in_specs=P("rollouts"), out_specs=P("rollouts"), check_vma=False))(x)
+np.savez(OUT, out)
+"""
+
+
+def results(code: str, count: int, out: Path, *flags: str) -> list:
     """What `code` saves to OUT in a process with `count` CPU devices."""
-    flags = f"--xla_force_host_platform_device_count={count}"
+    flags = " ".join([f"--xla_force_host_platform_device_count={count}", *flags])
     tests = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": tests}
     program = PREAMBLE + f"assert len(jax.devices()) == {count}\nOUT = {str(out)!r}\n" + code
@@ -157,6 +175,13 @@ def test_each_device_imagines_rollouts_of_its_own(tmp_path):
 
 def test_cores_with_few_rows_for_wide_models_work_together(tmp_path):
     results(WIDE, 2, tmp_path / "out.npz")
+
+
+@pytest.mark.slow
+def test_a_device_may_wait_for_another_for_long(tmp_path):
+    """By itself XLA aborts the process after a minute."""
+    (found,) = results(SLEEP, 2, tmp_path / "out.npz", *machine.PATIENT)
+    np.testing.assert_array_equal(found, [0, 1])
 
 
 @pytest.mark.parametrize(("count", "available", "size"), [(500, 2, 2), (50, 4, 2), (7, 4, 1), (5, 8, 5), (1, 3, 1)])

@@ -299,6 +299,18 @@ def test_a_batch_in_chunks_says_what_it_says_whole(monkeypatch):
         np.testing.assert_allclose(ours, theirs, rtol=1e-3, atol=1e-5)
 
 
+def test_a_gradient_of_the_size_of_rounding_is_not_followed_all_the_way():
+    """The curvature along it has a floor: the step shrinks with the advantages instead of having length `max_kl`."""
+    policy = random_policy(0, hidden=(5,))
+    batch = a_batch(1, policy, 1.0)
+    moved = []
+    for size in (1.0, 1e-9):
+        new, _ = improve(policy, batch._replace(advantages=np.float32(size) * batch.advantages), CONFIG)
+        moved.append(np.linalg.norm(ravel_pytree(new)[0] - ravel_pytree(policy)[0]))
+    assert moved[0] > 0.01
+    assert moved[1] < 0.01 * moved[0]
+
+
 @pytest.mark.parametrize("poison", ["advantages", "actions", "states"])
 def test_nan_leaves_the_policy_as_it_is(poison):
     policy = random_policy(0, hidden=(5,))

@@ -18,8 +18,8 @@ PATIENT = (
     "--xla_cpu_collective_call_warn_stuck_timeout_seconds=1000000",
     "--xla_cpu_collective_call_terminate_timeout_seconds=1000000",
 )
-"""A device of a CPU may wait for another as long as it takes. By itself XLA aborts the process after 40 s, which large
-batches, an overloaded machine or a process stopped for a while (Ctrl-Z) can take."""
+"""A device of a CPU may wait for another as long as it takes. By itself XLA aborts the process after a minute, which
+large batches, an overloaded machine or a process stopped for a while (Ctrl-Z) can take."""
 
 INSTALL_GPU = "pip install 'metrpo[gpu]' (NVIDIA, CUDA 12)"
 
