@@ -25,7 +25,7 @@ EXPLODED = 1e6
 CORE_CACHE, FEW_ROWS = 2**21, 100
 """Where a layer has more bytes of weights than the first, and a core fewer rows for each model than the second, one
 core alone reads more than it computes: the cores of a CPU then work together instead of each on rollouts of its own
-(docs/performance.md, "One JAX device per core")."""
+(docs/performance.md, "Cores together where one alone is starved")."""
 
 
 class ImagineInfo(NamedTuple):
