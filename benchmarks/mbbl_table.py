@@ -23,9 +23,9 @@ def ours(task: str) -> str:
     if not runs:
         return "not run"
     last = np.array([run[-1]["return_real"] for run in runs], float)
-    steps = min(int(run[-1]["real_steps"] or 0) for run in runs)
+    steps = sorted({f"{int(run[-1]['real_steps'] or 0) / 1000:.0f}k" for run in runs})
     spread = f"±{last.std():.1f}" if len(runs) > 1 else ""
-    return f"**{last.mean():.1f}{spread}** ({len(runs)} x {steps / 1000:.0f}k)"
+    return f"**{last.mean():.1f}{spread}** ({len(runs)} x {' and '.join(steps)})"
 
 
 def table() -> str:

@@ -106,11 +106,11 @@ def test_what_is_unknown_is_named(arguments, message):
 
 @pytest.mark.parametrize("scale", list(SCALES))
 def test_the_command_of_a_run_is_its_config(scale, monkeypatch):
-    """`metrpo train ...` with these arguments trains exactly this; every task once, and every system."""
+    """`metrpo train ...` with these arguments trains exactly this; every task once, and all settings."""
     monkeypatch.setattr(machine, "prepare", lambda *_: None)
     runs = runs_of("all", scale, seeds=1)
-    some = {run.system: run for run in runs} | {run.task: run for run in runs}
-    for run in {run.name: run for run in some.values()}.values():
+    settings = {(run.system, run.preset, run.overrides): run for run in runs}
+    for run in {run.name: run for run in [*settings.values(), *{run.task: run for run in runs}.values()]}.values():
         parsed = options.parse(["train", *run.arguments])
         assert Config(**{f.name: getattr(parsed, f.name) for f in dataclasses.fields(Config)}) == run.config
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -146,8 +145,8 @@ def _fit(width: str, products: str) -> Work:
     A block is what a run has: five passes and a validation.
     """
     train, validation = _data(FIT_STEPS * BATCH), _data(BATCH)
-    config = FitConfig(products=products, batch_size=BATCH, patience=99)  # type: ignore[arg-type]
-    config = replace(config, max_passes=2 * config.validate_every)
+    passes = FitConfig.validate_every
+    config = FitConfig(products=products, batch_size=BATCH, patience=99, max_passes=2 * passes)  # type: ignore[arg-type]
     ensemble = _ensemble(width)
 
     def steps() -> float:
@@ -158,7 +157,7 @@ def _fit(width: str, products: str) -> Work:
             stamps.append(time.perf_counter())
 
         fit(ensemble.networks, ensemble.normaliser, train, validation, config, jax.random.key(0), stamp)
-        return (stamps[1] - stamps[0]) / (config.validate_every * FIT_STEPS)
+        return (stamps[1] - stamps[0]) / (passes * FIT_STEPS)
 
     steps()
     # Forward, and backward to the weights of every layer and to the inputs of every layer but the first.
