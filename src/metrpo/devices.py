@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -39,20 +37,12 @@ def share_of(key: Any, axis: str | None) -> Any:
     return key if axis is None else jax.random.fold_in(key, jax.lax.axis_index(axis))
 
 
-def by_first(work: Callable[[Any], Any], share: Any, axis: str) -> Any:
-    """`work` on the whole batch by the first device alone; the others wait, and have zeros where it has results.
+def part_of(x: Any, axis: str, dimension: int) -> Any:
+    """This device's part, along `dimension`, of the arrays of `x`, which every device has whole."""
+    count, this = jax.lax.axis_size(axis), jax.lax.axis_index(axis)
 
-    The devices of a CPU have one pool of threads: the first then works with every core. `share` is this device's part
-    of the batch, along the first axis.
-    """
-    batch = jax.lax.all_gather(share, axis, tiled=True)
+    def part(a: Any) -> Any:
+        size = a.shape[dimension] // count
+        return jax.lax.dynamic_slice_in_dim(a, this * size, size, dimension)
 
-    def wait(batch: Any) -> Any:
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(work, batch))
-
-    return jax.lax.cond(jax.lax.axis_index(axis) == 0, work, wait, batch)
-
-
-def dealt(x: Any, axis: str, dimension: int) -> Any:
-    """Every device's part, along `dimension`, of the arrays of `x` that the first device has (see `by_first`)."""
-    return jax.lax.psum_scatter(x, axis, scatter_dimension=dimension, tiled=True)
+    return jax.tree.map(part, x)

@@ -6,7 +6,7 @@ would have to be vmapped to the same products, so the forty lines are written ou
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -29,6 +29,10 @@ class Ensemble(NamedTuple):
     def members(self) -> int:
         """K."""
         return int(self.networks[0][0].shape[0])
+
+    def outputs(self, x: Array) -> Array:
+        """What the networks say, each member to its own batch: [K, B, I] -> [K, B, D]."""
+        return network_outputs(self.networks, x)
 
 
 def init(
@@ -78,7 +82,22 @@ def normaliser_of(
     )
 
 
-def predict(ensemble: Ensemble, states: Array, actions: Array) -> Array:
+class Predictor(Protocol):
+    """What `predict` needs: an `Ensemble`, or one device's share of it (`metrpo.model.shared`)."""
+
+    @property
+    def members(self) -> int:
+        """K."""
+
+    @property
+    def normaliser(self) -> Normaliser:
+        """Shared by the members."""
+
+    def outputs(self, x: Array) -> Array:
+        """What the networks say, each member to its own batch: [K, B, I] -> [K, B, D]."""
+
+
+def predict(ensemble: Predictor, states: Array, actions: Array) -> Array:
     """Next states and what else is learned, each member for its own batch: [K, B, S], [K, B, A] -> [K, B, D]."""
     deltas = predict_delta(ensemble, states, actions)
     size = states.shape[-1]
@@ -87,17 +106,26 @@ def predict(ensemble: Ensemble, states: Array, actions: Array) -> Array:
     return jnp.concatenate([states + deltas[..., :size], deltas[..., size:]], axis=-1)
 
 
-def predict_delta(ensemble: Ensemble, states: Array, actions: Array) -> Array:
+def predict_delta(ensemble: Predictor, states: Array, actions: Array) -> Array:
     """Changes of state and what else is learned, each member for its own batch: [K, B, S], [K, B, A] -> [K, B, D]."""
     n = ensemble.normaliser
-    hidden = jnp.concatenate(
+    inputs = jnp.concatenate(
         [(states - n.state_mean) * n.state_scale, (actions - n.action_mean) * n.action_scale], axis=-1
     )
-    *inner, (last_weights, last_biases) = ensemble.networks
+    return n.delta_mean + n.delta_std * ensemble.outputs(inputs)
+
+
+def network_outputs(networks: Networks, x: Array) -> Array:
+    """Each member for its own batch: [K, B, I] -> [K, B, D]."""
+    *inner, last = networks
     for weights, biases in inner:
-        hidden = jax.nn.relu(_product(hidden, weights) + biases)
-    output = _product(hidden, last_weights) + last_biases
-    return n.delta_mean + n.delta_std * output
+        x = jax.nn.relu(layer_outputs(x, weights, biases))
+    return layer_outputs(x, *last)
+
+
+def layer_outputs(x: Array, weights: Array, biases: Array) -> Array:
+    """Before the nonlinearity, each member for its own batch: [K, B, I] -> [K, B, O]."""
+    return _product(x, weights) + biases
 
 
 def first_member(ensemble: Ensemble) -> Ensemble:

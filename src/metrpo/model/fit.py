@@ -53,7 +53,7 @@ def fit(
     Stops when no member has improved for `config.patience` passes, at the latest after `config.max_passes` or
     `config.max_steps`.
     `on_validation(passes, best losses [K])` is called at every validation. Adam starts afresh. Members are spread over
-    JAX's devices where their number allows (paper, section 5: "could potentially yield multiple-fold speed-up").
+    JAX's devices where their number allows, as the paper suggests (appendix "Real-time complexity").
     """
     optimizer = optimizer_of(config)
     loss = validation_loss(Ensemble(networks, normaliser), validation, config.loss_units)

@@ -7,13 +7,14 @@ first and then what else is learned. They stand in one table, `SAMPLINGS` (paper
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from metrpo.devices import across, by_first, dealt, share_of
-from metrpo.model.ensemble import Ensemble, first_member, predict, predict_delta
+from metrpo.devices import across, part_of, share_of
+from metrpo.model.ensemble import Ensemble, Predictor, first_member, predict, predict_delta
+from metrpo.model.shared import can_share, shared
 from metrpo.types import Act, Array, Trajectories
 
 Reward = Callable[[Array, Array, Array], Array]
@@ -23,9 +24,9 @@ EXPLODED = 1e6
 """A rollout with a state beyond this, or a reward beyond its square, has diverged, as has one that meets NaN."""
 
 CORE_CACHE, FEW_ROWS = 2**21, 100
-"""Where a layer has more bytes of weights than the first, and a core fewer rows for each model than the second, one
-core alone reads more than it computes: the cores of a CPU then work together instead of each on rollouts of its own
-(docs/performance.md, "Cores together where one alone is starved")."""
+"""Where a layer has as many bytes of weights as the first, and a core fewer rows for each model than the second, one
+core alone reads more than it computes: the cores of a CPU then share the models instead of the rollouts
+(docs/performance.md, "Models shared by the cores")."""
 
 
 class ImagineInfo(NamedTuple):
@@ -64,17 +65,17 @@ class Keys(NamedTuple):
     """The same in all steps of a batch of episodes."""
 
 
-def step_rand(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
+def step_rand(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
     """One model drawn at random for each state and step (paper, section 5)."""
     return _of_drawn_models(ensemble, states, actions, keys.step)
 
 
-def eps_rand(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
+def eps_rand(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
     """One model drawn at random for each episode."""
     return _of_drawn_models(ensemble, states, actions, keys.episode)
 
 
-def _of_drawn_models(ensemble: Ensemble, states: Array, actions: Array, key: Array) -> Array:
+def _of_drawn_models(ensemble: Predictor, states: Array, actions: Array, key: Array) -> Array:
     slots, _ = model_choice(key, states.shape[0], ensemble.members)
     # The blanks repeat the last state; their predictions are dropped.
     grouped = predict(
@@ -112,12 +113,12 @@ def _of_all_models(ensemble: Ensemble, states: Array, actions: Array) -> Array:
     return predict(ensemble, *(_for_all(ensemble, x) for x in (states, actions)))
 
 
-def _for_all(ensemble: Ensemble, x: Array) -> Array:
+def _for_all(ensemble: Predictor, x: Array) -> Array:
     """[N, ...] -> [K, N, ...], the same for every model."""
     return jnp.broadcast_to(x, (ensemble.members, *x.shape))
 
 
-SAMPLINGS: dict[str, Callable[[Ensemble, Array, Array, Keys], Array]] = {
+SAMPLINGS: dict[str, Callable[[Any, Array, Array, Keys], Array]] = {
     "step_rand": step_rand,
     "model_mean_std": model_mean_std,
     "model_mean": model_mean,
@@ -142,7 +143,7 @@ def outcome(
     return following, rewards, None if terminated is None else terminated(following)
 
 
-def disagreement(ensemble: Ensemble, states: Array, actions: Array) -> Array:
+def disagreement(ensemble: Predictor, states: Array, actions: Array) -> Array:
     """How far the models' predictions spread, [N, S], [N, A] -> [N]: their standard deviation, in units of each
     dimension's std in the data, mean over the dimensions (the paper's section "Discussion": a reason to explore)."""
     deltas = predict_delta(ensemble, *(_for_all(ensemble, x) for x in (states, actions)))
@@ -166,20 +167,31 @@ def imagine(
 
     Actions are clipped to [-1, 1] for dynamics and reward, and recorded as drawn. Rewards hold `curiosity` times the
     models' disagreement. With `axis`, `starts` are this device's share of the batch; the trajectories stay with it, the
-    info is about all (see `metrpo.devices`). A CPU's devices share the work, unless the models are too wide for that:
-    then the first does all of it, with every core.
+    info is about all (see `metrpo.devices`). A CPU's devices share the rollouts, or, where the models are too wide for
+    that, the models.
     """
-    if axis is not None and _for_all_cores(ensemble, starts.shape[0], sampling):
+    given = act, reward, terminated
+    if axis is None or not _shares_models(ensemble, starts.shape[0], sampling, axis):
+        return _imagine(ensemble, *given, starts, horizon, share_of(key, axis), sampling, axis, curiosity)
+    everywhere = jax.lax.all_gather(starts, axis, tiled=True)
+    batch, info = _imagine(shared(ensemble, axis), *given, everywhere, horizon, key, sampling, None, curiosity)
+    *steps, last, going_on = batch
+    return Trajectories(*part_of(steps, axis, 1), *part_of((last, going_on), axis, 0)), info
 
-        def whole(starts: Array) -> tuple[Trajectories, ImagineInfo]:
-            return imagine(ensemble, act, reward, terminated, starts, horizon, key, sampling, None, curiosity)
 
-        batch, info = by_first(whole, starts, axis)
-        *steps, last, going_on = batch
-        mine = Trajectories(*dealt(steps, axis, 1), *dealt((last, going_on), axis, 0))
-        return mine, across(info, axis)
+def _imagine(
+    ensemble: Predictor,
+    act: Act,
+    reward: Reward | None,
+    terminated: Terminated | None,
+    starts: Array,
+    horizon: int,
+    key: Array,
+    sampling: str,
+    axis: str | None,
+    curiosity: float,
+) -> tuple[Trajectories, ImagineInfo]:
     next_state = SAMPLINGS[sampling]
-    key = share_of(key, axis)
     episode_key = jax.random.fold_in(key, horizon)
 
     def step(carry: tuple[Array, Array, Array], key: Array) -> tuple[tuple[Array, Array, Array], Trajectories]:
@@ -211,11 +223,13 @@ def imagine(
     return trajectories._replace(mask=mask, last=last, going_on=alive * (1.0 - diverged)), info
 
 
-def _for_all_cores(ensemble: Ensemble, rows: int, sampling: str) -> bool:
-    """Whether one core of a CPU with `rows` rollouts is better off helping others (`CORE_CACHE`)."""
+def _shares_models(ensemble: Ensemble, rows: int, sampling: str, axis: str) -> bool:
+    """Whether cores of a CPU with `rows` rollouts each do better to share the models (`CORE_CACHE`)."""
+    if jax.default_backend() != "cpu" or sampling not in ("step_rand", "eps_rand"):
+        return False
     largest = max(weights[0].nbytes for weights, _ in ensemble.networks)
-    models = ensemble.members if sampling in ("step_rand", "eps_rand") else 1
-    return jax.default_backend() == "cpu" and largest > CORE_CACHE and rows < FEW_ROWS * models
+    few = rows < FEW_ROWS * ensemble.members
+    return largest >= CORE_CACHE and few and can_share(ensemble.networks, jax.lax.axis_size(axis))
 
 
 def _sound(states: Array, rewards: Array) -> Array:
