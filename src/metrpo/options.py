@@ -190,7 +190,8 @@ class Doctor:
 class Bench:
     """Measure this machine and our work on it: fitting, imagination, policy updates, whole iterations.
 
-    Run nothing else meanwhile. All pieces are timed in turns, round after round, so that all see the same machine; medians count.
+    Run nothing else meanwhile. All pieces are timed in turns, round after round, so that all see the same machine;
+    medians count.
     For example:
         metrpo bench
         metrpo bench --peers --rounds 9 --json > bench.json
