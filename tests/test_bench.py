@@ -74,7 +74,7 @@ def fake(monkeypatch):
 @pytest.mark.parametrize(
     ("takes", "expected", "repetitions"),
     # The first finds the caches cold; what is longer than a turn is done once.
-    [([0.4, 0.2, 0.1, 0.3, 0.1], 0.15, 5), ([1.2], 1.2, 1), ([0.9, 0.2], 0.2, 2)],
+    [([0.5, 0.25, 0.125, 0.375], 0.25, 4), ([1.2], 1.2, 1), ([0.9, 0.2], 0.2, 2)],
 )
 def test_short_work_is_repeated_and_its_first_repetition_not_counted(takes, expected, repetitions, monkeypatch):
     clock, done = [0.0], []
