@@ -152,7 +152,7 @@ def disagreement(ensemble: Predictor, states: Array, actions: Array) -> Array:
 
 
 def imagine(
-    ensemble: Ensemble,
+    ensemble: Predictor,
     act: Act,
     reward: Reward | None,
     terminated: Terminated | None,
@@ -170,27 +170,13 @@ def imagine(
     info is about all (see `metrpo.devices`). A CPU's devices share the rollouts, or, where the models are too wide for
     that, the models.
     """
-    given = act, reward, terminated
-    if axis is None or not _shares_models(ensemble, starts.shape[0], sampling, axis):
-        return _imagine(ensemble, *given, starts, horizon, share_of(key, axis), sampling, axis, curiosity)
-    everywhere = jax.lax.all_gather(starts, axis, tiled=True)
-    batch, info = _imagine(shared(ensemble, axis), *given, everywhere, horizon, key, sampling, None, curiosity)
-    *steps, last, going_on = batch
-    return Trajectories(*part_of(steps, axis, 1), *part_of((last, going_on), axis, 0)), info
-
-
-def _imagine(
-    ensemble: Predictor,
-    act: Act,
-    reward: Reward | None,
-    terminated: Terminated | None,
-    starts: Array,
-    horizon: int,
-    key: Array,
-    sampling: str,
-    axis: str | None,
-    curiosity: float,
-) -> tuple[Trajectories, ImagineInfo]:
+    rows = starts.shape[0]
+    if axis is not None and isinstance(ensemble, Ensemble) and _shares_models(ensemble, rows, sampling, axis):
+        members, everywhere = shared(ensemble, axis), jax.lax.all_gather(starts, axis, tiled=True)
+        batch, info = imagine(members, act, reward, terminated, everywhere, horizon, key, sampling, None, curiosity)
+        *steps, last, going_on = batch
+        return Trajectories(*part_of(steps, axis, 1), *part_of((last, going_on), axis, 0)), info
+    key = share_of(key, axis)
     next_state = SAMPLINGS[sampling]
     episode_key = jax.random.fold_in(key, horizon)
 
@@ -212,12 +198,11 @@ def _imagine(
         following = jnp.where(bad[:, None], states, following)
         return (following, alive, diverged), recorded
 
-    count = starts.shape[0]
-    carry = (starts, jnp.ones(count), jnp.zeros(count, bool))
+    carry = (starts, jnp.ones(rows), jnp.zeros(rows, bool))
     (last, alive, diverged), trajectories = jax.lax.scan(step, carry, jax.random.split(key, horizon))
     mask = trajectories.mask * (1.0 - diverged)
     total, lost, rollouts, steps = across(
-        (jnp.sum(trajectories.rewards * mask), jnp.sum(diverged), jnp.float32(count), jnp.sum(mask)), axis
+        (jnp.sum(trajectories.rewards * mask), jnp.sum(diverged), jnp.float32(rows), jnp.sum(mask)), axis
     )
     info = ImagineInfo(total / jnp.maximum(rollouts - lost, 1), lost / rollouts, steps)
     return trajectories._replace(mask=mask, last=last, going_on=alive * (1.0 - diverged)), info
