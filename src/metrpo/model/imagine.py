@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from metrpo.devices import across, part_of, share_of
+from metrpo.devices import across, share_of
 from metrpo.model.ensemble import Ensemble, Predictor, first_member, predict, predict_delta
 from metrpo.model.shared import can_share, shared
 from metrpo.types import Act, Array, Trajectories
@@ -152,7 +152,7 @@ def disagreement(ensemble: Predictor, states: Array, actions: Array) -> Array:
 
 
 def imagine(
-    ensemble: Predictor,
+    ensemble: Ensemble,
     act: Act,
     reward: Reward | None,
     terminated: Terminated | None,
@@ -167,15 +167,13 @@ def imagine(
 
     Actions are clipped to [-1, 1] for dynamics and reward, and recorded as drawn. Rewards hold `curiosity` times the
     models' disagreement. With `axis`, `starts` are this device's share of the batch; the trajectories stay with it, the
-    info is about all (see `metrpo.devices`). A CPU's devices share the rollouts, or, where the models are too wide for
-    that, the models.
+    info is about all (see `metrpo.devices`). A CPU's devices share the models too, where these are too wide for a core.
     """
     rows = starts.shape[0]
-    if axis is not None and isinstance(ensemble, Ensemble) and _shares_models(ensemble, rows, sampling, axis):
-        members, everywhere = shared(ensemble, axis), jax.lax.all_gather(starts, axis, tiled=True)
-        batch, info = imagine(members, act, reward, terminated, everywhere, horizon, key, sampling, None, curiosity)
-        *steps, last, going_on = batch
-        return Trajectories(*part_of(steps, axis, 1), *part_of((last, going_on), axis, 0)), info
+    if axis is not None and _shares_models(ensemble, rows, sampling, axis):
+        members: Predictor = shared(ensemble, axis)
+    else:
+        members = ensemble
     key = share_of(key, axis)
     next_state = SAMPLINGS[sampling]
     episode_key = jax.random.fold_in(key, horizon)
@@ -185,10 +183,10 @@ def imagine(
         action_key, model_key = jax.random.split(key)
         actions = act(states, action_key)
         clipped = jnp.clip(actions, -1.0, 1.0)
-        predicted = next_state(ensemble, states, clipped, Keys(model_key, episode_key))
+        predicted = next_state(members, states, clipped, Keys(model_key, episode_key))
         following, rewards, ended = outcome(reward, terminated, states, clipped, predicted)
         if curiosity:
-            rewards = rewards + curiosity * disagreement(ensemble, states, clipped)
+            rewards = rewards + curiosity * disagreement(members, states, clipped)
         bad = ~_sound(following, rewards)
         recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive)
         diverged = diverged | (bad & (alive > 0))

@@ -1,8 +1,8 @@
 """An ensemble whose members are shared out among the cores of a CPU, each a JAX device (see `metrpo.devices`).
 
 Worth it where an ensemble has more weights than a core's cache and few states for each member: every core then reads
-its share of the weights, not all. (The paper suggests members in parallel for the fit, appendix "Real-time
-complexity".)
+its share of the weights, not all, and predicts for the states of all. (The paper suggests members in parallel for the
+fit, appendix "Real-time complexity".)
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _UNITS, _INPUTS = 2, 1
 class SharedEnsemble(NamedTuple):
     """One device's share of an ensemble. It stands for the `Ensemble` in `predict` and `predict_delta`.
 
-    All devices along `axis` must ask for the same predictions; all get them.
+    Every device along `axis` asks for predictions of states of its own, as many as the others, and gets these.
     """
 
     own: Networks
@@ -40,8 +40,9 @@ class SharedEnsemble(NamedTuple):
         return own * jax.lax.axis_size(self.axis) + remaining
 
     def outputs(self, x: Array) -> Array:
-        """What the networks say, each member to its own batch: [K, B, I] -> [K, B, D]."""
+        """What the networks say, each member to its own batch: [K, B, I] -> [K, B, D], of this device's states."""
         own, remaining = (len(networks[0][0]) for networks in (self.own, self.cut))
+        x = jax.lax.all_gather(x, self.axis, axis=1, tiled=True)
         outputs = jnp.zeros((*x.shape[:2], self.own[-1][1].shape[-1]))
         if own:
             first = own * jax.lax.axis_index(self.axis)
@@ -49,7 +50,7 @@ class SharedEnsemble(NamedTuple):
             outputs = jax.lax.dynamic_update_slice_in_dim(outputs, mine, first, 0)
         if remaining:
             outputs = outputs.at[-remaining:].set(self._summands(x[-remaining:]))
-        return jax.lax.psum(outputs, self.axis)
+        return jax.lax.psum_scatter(outputs, self.axis, scatter_dimension=1, tiled=True)
 
     def _summands(self, x: Array) -> Array:
         """This device's part of the remaining members' outputs, which are the sums of the parts."""
