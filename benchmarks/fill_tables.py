@@ -14,7 +14,7 @@ from summarise import HEADER, ROOT, table
 PAGE, FIGURES = ROOT.parent / "docs" / "reproduction.md", ROOT / "laptop" / "figures"
 PAGES = {
     "README.md": ["laptop/*/me-trpo"],
-    "docs/fast-preset.md": ["ensemble-size", "fast-before", "fast-choices"],
+    "docs/fast-preset.md": ["ensemble-size", "fast-after", "fast-before", "fast-choices"],
     "docs/environments.md": ["own"],
 }
 
