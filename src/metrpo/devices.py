@@ -38,11 +38,6 @@ def share_of(key: Any, axis: str | None) -> Any:
 
 
 def part_of(x: Any, axis: str, dimension: int) -> Any:
-    """This device's part, along `dimension`, of the arrays of `x`, which every device has whole."""
-    count, this = jax.lax.axis_size(axis), jax.lax.axis_index(axis)
-
-    def part(a: Any) -> Any:
-        size = a.shape[dimension] // count
-        return jax.lax.dynamic_slice_in_dim(a, this * size, size, dimension)
-
-    return jax.tree.map(part, x)
+    """This device's part, along `dimension`, of the array `x`, which every device has whole."""
+    size = x.shape[dimension] // jax.lax.axis_size(axis)
+    return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(axis) * size, size, dimension)

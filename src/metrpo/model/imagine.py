@@ -170,10 +170,9 @@ def imagine(
     info is about all (see `metrpo.devices`). A CPU's devices share the models too, where these are too wide for a core.
     """
     rows = starts.shape[0]
+    models: Predictor = ensemble
     if axis is not None and _shares_models(ensemble, rows, sampling, axis):
-        members: Predictor = shared(ensemble, axis)
-    else:
-        members = ensemble
+        models = shared(ensemble, axis)
     key = share_of(key, axis)
     next_state = SAMPLINGS[sampling]
     episode_key = jax.random.fold_in(key, horizon)
@@ -183,10 +182,10 @@ def imagine(
         action_key, model_key = jax.random.split(key)
         actions = act(states, action_key)
         clipped = jnp.clip(actions, -1.0, 1.0)
-        predicted = next_state(members, states, clipped, Keys(model_key, episode_key))
+        predicted = next_state(models, states, clipped, Keys(model_key, episode_key))
         following, rewards, ended = outcome(reward, terminated, states, clipped, predicted)
         if curiosity:
-            rewards = rewards + curiosity * disagreement(members, states, clipped)
+            rewards = rewards + curiosity * disagreement(models, states, clipped)
         bad = ~_sound(following, rewards)
         recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive)
         diverged = diverged | (bad & (alive > 0))
