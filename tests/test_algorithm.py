@@ -21,6 +21,7 @@ from metrpo.model.imagine import ImagineInfo, imagine
 from metrpo.policy import advantage, gaussian, trpo
 from metrpo.policy.batch import Batch, ImproveInfo
 from metrpo.policy.improve import Memory
+from metrpo.policy.inputs import folded, inputs_of, normalised
 from metrpo.presets import override, preset
 from metrpo.run import clock as clock_module
 from metrpo.run.progress import SILENT, Progress
@@ -326,7 +327,7 @@ class Script:
         ensemble = random_ensemble(0, 2, 2, 2)
         return algorithm._improve(config, probe.PROBE, state, state.dataset, ensemble, 3, SILENT, clock)
 
-    def _updates(self, task, config, ensemble, policy, memory, starts, key):
+    def _updates(self, task, config, ensemble, policy, memory, starts, key, inputs):
         count = len(starts)
         assert np.all(np.asarray(memory.baseline) == self.number(policy)), "baseline and policy go on together"
         self.blocks.append((self.number(policy), count))
@@ -338,7 +339,7 @@ class Script:
         infos = ImproveInfo(zeros + 0.25, zeros, accepted, zeros, zeros), ImagineInfo(zeros, zeros + 0.5, zeros)
         return moved, memory._replace(baseline=memory.baseline + count), infos
 
-    def _validate(self, task, ensemble, policy, starts, horizon, curiosity):
+    def _validate(self, task, ensemble, policy, starts, config, inputs, baseline):
         self.fixed_starts.append(starts)
         return np.array(self.values[self.number(policy)], np.float32)
 
@@ -389,7 +390,7 @@ def test_the_phase_ends_when_the_patience_is_over_and_returns_to_the_accepted(
     assert script.info.validations == expected[1] // every
     np.testing.assert_array_equal(script.info.values, script.values[expected[0]])
     assert len(set(script.keys)) == len(script.blocks), "every block has randomness of its own"
-    assert np.all(np.asarray(script.baseline) == expected[1]), "the baseline is the last fit, whatever was accepted"
+    assert np.all(np.asarray(script.baseline) == expected[0]), "the baseline goes back with the policy"
 
 
 def test_the_last_block_is_cut_to_the_most_updates(tiny, monkeypatch):
@@ -435,6 +436,78 @@ def test_a_rejected_policys_values_are_no_reference(tiny, monkeypatch):
     values = {n: [-9.0] * 2 for n in range(0, 100, 5)}
     values |= {0: [10.0, 10.0], 5: [20.0, 0.0], 10: [11.0, 11.0]}
     assert Script(monkeypatch, tiny, values).result == (10, 35, 10)
+
+
+def test_where_episodes_are_cut_both_policies_are_held_against_the_same_value(tiny, monkeypatch):
+    """The value at the cut moves with the baseline: the accepted policy is valued anew beside each candidate."""
+    script = Script(monkeypatch, tiny, all_models([5]))
+    asked = []
+
+    def value(task, ensemble, policy, starts, config, inputs, baseline):
+        asked.append((script.number(policy), float(np.asarray(baseline)[0])))
+        return script._validate(task, ensemble, policy, starts, config, inputs, baseline)
+
+    monkeypatch.setattr(phase, "values_of", value)
+    short = {"imagine.horizon": 5, "advantage.discount": 0.9, "validate.patience": 10}
+    _, _, info = script.run(override(script.config, short))
+    assert asked == [(0, 0), (5, 5), (0, 5), (10, 10), (5, 10), (15, 15), (5, 15)]
+    assert info.accepted_updates == 5
+    asked.clear()
+    script.run(override(script.config, short | {"imagine.horizon": probe.HORIZON}))
+    assert asked == [(0, 0), (5, 5), (10, 10), (15, 15)], "at a true end there is nothing to value"
+
+
+def test_the_oracle_plays_other_starts_than_the_record(tiny, monkeypatch):
+    seeds = []
+
+    def evaluate(task, act, episodes, seed):
+        seeds.append(seed)
+        return np.arange(episodes, dtype=float)
+
+    monkeypatch.setattr(algorithm.real, "evaluate", evaluate)
+    algorithm.step(override(TINY, {"validate.rule": "real"}), tiny.states[1])
+    *oracle, record = seeds
+    assert len(oracle) >= 2
+    assert len(set(oracle)) == 1, "policies are compared on the same starts"
+    assert record not in oracle
+
+
+# ---------------------------------------------------------------- normalised states
+
+
+def test_a_phase_on_normalised_states_begins_with_the_same_policy(tiny, monkeypatch):
+    config, ensemble = override(TINY, {"policy.normalise": True}), random_ensemble(0, 2, 2, 2)
+    state, seen = tiny.states[2], []
+    monkeypatch.setattr(phase, "values_of", lambda task, ensemble, policy, *rest: seen.append((policy, rest)) or [0.0])
+    policy, *_ = algorithm._improve(config, probe.PROBE, state, state.dataset, ensemble, 3, SILENT, algorithm.Clock())
+    (inside, (_, _, inputs, _)), *_ = seen
+    rows = state.dataset.train.states
+    np.testing.assert_allclose(normalised(inputs, rows).std(0), 1, rtol=1e-3)
+    for now in (gaussian.mean(jax.device_get(policy), rows), gaussian.mean(inside, normalised(inputs, rows))):
+        np.testing.assert_allclose(now, gaussian.mean(jax.device_get(state.policy), rows), atol=1e-5)
+
+
+@pytest.mark.parametrize(("offset", "scale"), [(0.0, 1e-3), (5000.0, 1.0), (-20.0, 50.0)])
+def test_parameter_noise_does_not_know_the_units_of_the_states(offset, scale):
+    """The same noise moves the actions as much, whatever the states' offset and scale."""
+    rows = np.random.default_rng(0).standard_normal((200, 2))
+    plain, other = inputs_of(rows), inputs_of(offset + scale * rows)
+    now, before = random_policy(1, 2, 2, hidden=(4,)), random_policy(2, 2, 2, hidden=(4,))
+
+    def actions(inputs, states):
+        policies = (folded(p, inputs) for p in (now, before))
+        act = algorithm._perturbed(*policies, 3.0, np.random.default_rng(5), inputs)
+        return np.array([act(s) for s in states])
+
+    np.testing.assert_allclose(actions(other, offset + scale * rows), actions(plain, rows), atol=0.05)
+
+
+def test_the_standard_deviation_is_kept_from_phase_to_phase_where_the_config_says_so(tiny, monkeypatch):
+    script = Script(monkeypatch, tiny, all_models([10]))
+    kept = override(script.config, {"policy.keep_std": True, "policy.min_std": 0.2})
+    script.state = script.state._replace(policy=script.state.policy._replace(log_std=np.float32([-1.0, -3.0])))
+    accepted, _, _ = script.run(kept)
+    np.testing.assert_allclose(accepted.log_std, np.float32([-1.0, np.log(0.2)]) - 10, rtol=1e-6)
 
 
 def test_the_standard_deviation_is_set_back_at_the_start_of_the_phase(tiny, monkeypatch):

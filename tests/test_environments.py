@@ -475,9 +475,9 @@ def test_short_imagined_episodes_start_anywhere_and_are_more(blind, monkeypatch)
     config = override(LEARN, {**SHORT, "iterations": 1, "imagine.steps": 100, "validate.max_updates": 5})
     pools, updates = [], phase._updates
 
-    def spied(task, config, ensemble, policy, memory, starts, key):
+    def spied(task, config, ensemble, policy, memory, starts, *rest):
         pools.append(np.asarray(starts))
-        return updates(task, config, ensemble, policy, memory, starts, key)
+        return updates(task, config, ensemble, policy, memory, starts, *rest)
 
     monkeypatch.setattr(phase, "_updates", spied)
     state = training.train(config)

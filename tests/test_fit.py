@@ -227,9 +227,11 @@ def test_a_diverged_member_keeps_its_best_weights():
         ([[30], []], {}, 25),
         ([range(5, 2000, 5), []], {"max_passes": 40}, 40),
         ([[3], []], {"validate_every": 3, "patience": 7}, 12),
-        # 30 minibatches are 10 passes of 3, 31 need a part of the third block, and it is trained whole
+        # 30 minibatches are 10 passes of 3; the 31st begins the eleventh
         ([range(5, 2000, 5), []], {"max_steps": 30}, 10),
-        ([range(5, 2000, 5), []], {"max_steps": 31}, 15),
+        ([range(5, 2000, 5), []], {"max_steps": 31}, 11),
+        ([range(5, 2000, 5), []], {"max_steps": 7}, 3),
+        ([range(5, 2000, 5), []], {"max_passes": 12}, 12),
         ([range(5, 2000, 5), []], {"max_steps": 30, "max_passes": 5}, 5),
         ([[], []], {"max_steps": 3000}, 25),
     ],
@@ -257,7 +259,12 @@ def test_fitting_stops_when_no_member_has_improved_for_the_patience(monkeypatch,
     assert info.passes == passes
     every = config.validate_every
     # 3,500 rows are 3 minibatches of 1,000: a pass is 3 steps, whatever the capacity.
-    assert trained == [(p, 3 * every) for p in range(every, passes + 1, every)]
+    total = sum(steps for _, steps in trained)
+    assert total == min(3 * passes, config.max_steps or 3 * passes), "a maximum is a maximum"
+    whole, (last, rest) = trained[:-1], trained[-1]
+    assert whole == [(p, 3 * every) for p in range(every, last, every)]
+    assert last == passes
+    assert 0 < rest <= 3 * every
     assert [p for p, _ in told] == [p for p, _ in trained]
     np.testing.assert_array_equal(told[-1][1], info.validation_loss)
 

@@ -136,6 +136,26 @@ def test_returns_per_model_are_those_of_a_slow_loop(terminated):
     assert len(np.unique(np.round(slow.mean(1), 2))) == 3, "the models must differ"
 
 
+def test_what_follows_the_last_step_is_worth_its_value_and_rewards_are_discounted():
+    ensemble, policy = random_ensemble(5, members=2, state_size=2, action_size=2, scale=0.3), random_policy(6, 2, 2)
+    starts = np.random.default_rng(0).uniform(-0.7, 0.7, (5, 2)).astype(np.float32)
+    slow = np.zeros((2, 5))
+    for k in range(2):
+        for n, state in enumerate(starts.astype(float)):
+            for t in range(4):
+                action = np.clip(slow_mean(policy, state), -1, 1)
+                following = state + slow_delta(ensemble, k, state, action)
+                slow[k, n] += 0.9**t * probe.reward(state, action, following)
+                state = following
+                if probe.beyond(state):
+                    break
+            else:
+                slow[k, n] += 0.9**4 * 7 * state[1]
+    act, after = partial(gaussian.mean, policy), lambda states: 7 * states[..., 1]
+    got = jax.jit(lambda e, s: returns_per_model(e, act, probe.reward, probe.beyond, s, 4, 0.0, 0.9, after))
+    np.testing.assert_allclose(got(ensemble, starts), slow.mean(1), rtol=1e-3)
+
+
 def growing(factors):
     """Members s' = factor s, of one dimension."""
     return linear_ensemble([(np.array([[f]]), np.zeros((1, 1))) for f in factors])

@@ -18,7 +18,7 @@ from metrpo.policy.linearised import chunked, linearise
 
 COUNT, STATE, ACTION = 24, 4, 2
 CONFIG = TRPOConfig()
-improve = on_host(static_argnames="config")(trpo.improve)
+improve = on_host(static_argnames=("config", "penalty"))(trpo.improve)
 
 
 def conjugate_gradient(matrix, target, iterations):
@@ -145,6 +145,41 @@ def test_the_step_is_the_natural_gradient_of_length_max_kl():
     assert info.accepted
     assert info.cg_residual < 1e-3
     np.testing.assert_allclose(step, full * 0.8 ** int(info.backtracks), atol=2e-3 * np.abs(full).max())
+
+
+def slow_penalty(policy, batch):
+    """The squared excess of mean actions beyond [-1, 1], summed over actions, mean over the steps that count."""
+    states = batch.states[batch.mask > 0]
+    means = np.array([slow_mean(policy, s) for s in states])
+    return np.mean(np.sum(np.maximum(np.abs(means) - 1, 0) ** 2, axis=1))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_penalty_is_taken_from_the_surrogate(seed):
+    policy = random_policy(seed, hidden=(5,), scale=4.0)
+    batch = a_batch(seed + 1, policy)
+    new, info = improve(policy, batch, CONFIG, penalty=0.5)
+    before, after = (slow_surrogate_and_kl(policy, p, batch)[0] - 0.5 * slow_penalty(p, batch) for p in (policy, new))
+    assert slow_penalty(policy, batch) > 0.1, "the case must be one that pays"
+    assert info.accepted
+    assert after - before == pytest.approx(float(info.improvement), rel=0.02, abs=2e-4)
+
+
+def test_the_penalty_alone_leads_saturated_means_back():
+    """Where no action is better than another, clipped means still come back to the limits, and stay there."""
+    policy = gaussian.Policy(((np.zeros((1, 1), np.float32), np.float32([3.0])),), np.zeros(1, np.float32))
+    states = np.zeros((64, 1), np.float32)
+
+    def after(updates, penalty):
+        now = policy
+        for _ in range(updates):
+            means = np.array([slow_mean(now, s) for s in states])
+            batch = Batch(states, means.astype(np.float32), np.zeros(64, np.float32), np.ones(64, np.float32))
+            now, _ = improve(now, batch, TRPOConfig(max_kl=0.05), penalty=penalty)
+        return float(now.layers[0][1][0])
+
+    assert after(5, 0.0) == 3.0, "no gradient, no step"
+    assert after(40, 0.05) == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_gaussian_bandit_moves_as_the_closed_form_says():

@@ -38,6 +38,7 @@ from metrpo.phase import PhaseInfo
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improve import Baseline, init_baseline
+from metrpo.policy.inputs import Inputs, folded, inputs_of, unfolded
 from metrpo.run.clock import Clock
 from metrpo.run.progress import SILENT, Progress
 from metrpo.seeds import Stage, key_of, rng_of
@@ -126,7 +127,10 @@ def collect(
     """
     enough = (0 if config.real_steps == 0 else config.collect.steps) if at_least is None else at_least
     progress.stage("collect", enough)
-    mean = partial(_perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise)
+    inputs = _inputs(config, task_for(config), state.dataset)
+    mean = partial(
+        _perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise, inputs=inputs
+    )
     explorer = lambda rng: real.explore(mean(rng), config.collect, rng)  # noqa: E731
     episodes = [] if log is None else log.pending()
     steps = sum(len(e.rewards) for e in episodes)
@@ -162,6 +166,9 @@ def learn(
         require_finite("fit", iteration, "start anew with a lower fit.learning_rate", **ensemble._asdict())
     with clock("improve"):
         progress.stage("improve", config.validate.max_updates)
+        if state.iteration == 0 and (inputs := _inputs(config, task, dataset)):
+            # A fresh policy's weights are meant for normalised states; by what, only the first data say.
+            state = state._replace(policy=folded(state.policy, inputs))
         policy, baseline, improved = _improve(config, task, state, dataset, ensemble, iteration, progress, clock)
         advice = "the run was resumed from, or became, a state that cannot go on: use smaller steps or start anew"
         require_finite("improve", iteration, advice, policy=policy, baseline=baseline)
@@ -181,7 +188,7 @@ def learn(
         dataset=dataset,
     )
     collected = float(np.mean([e.rewards.sum() for e in episodes])) if episodes else math.nan
-    row = _row(config, state, returns, collected, fitted, improved)
+    row = _row(config, state, returns, collected, fitted, improved, phase.is_cut(config, task))
     row |= diagnosis.row() | {f"improved_{k}": float(share) for k, share in enumerate(improved.improved)}
     if "end" in task.learned:
         trust = end_calibration(ensemble, dataset.validation)
@@ -245,13 +252,14 @@ def _improve(
 
     def oracle(policy: Policy) -> float:
         with naming("validate", iteration):
-            return float(np.mean(evaluate(config, task, policy, iteration)))
+            # Its starts are others than the record's, which would else be a selected maximum.
+            return float(np.mean(evaluate(config, task, policy, iteration, Stage.ORACLE)))
 
     return phase.improve(
         config,
         task,
         ensemble,
-        gaussian.reset_std(state.policy, config.policy.initial_std),
+        _with_std(config, state),
         state.baseline,
         starts,
         rng,
@@ -259,7 +267,22 @@ def _improve(
         clock,
         lambda updates, accepted, value: progress.update(updates, f"accepted {accepted}, imagined return {value:.2f}"),
         oracle,
+        _inputs(config, task, dataset),
     )
+
+
+def _inputs(config: Config, task: Task, dataset: Dataset) -> Inputs | None:
+    """What the policy sees of a state; None: all of it, as it is."""
+    seen = config.policy.normalise and dataset.train.size > 0
+    return inputs_of(dataset.train.states, task.unseen) if seen else None
+
+
+def _with_std(config: Config, state: State) -> Policy:
+    """The policy with the standard deviation that a phase starts from."""
+    if config.policy.keep_std and state.iteration > 0:
+        least = np.float32(math.log(config.policy.min_std))
+        return state.policy._replace(log_std=np.maximum(np.asarray(state.policy.log_std), least))
+    return gaussian.reset_std(state.policy, config.policy.initial_std)
 
 
 def _logged(config: Config, task: Task) -> Dataset:
@@ -279,25 +302,32 @@ def task_for(config: Config) -> Task:
     return without_formulas(task) if config.learn_reward else task
 
 
-def evaluate(config: Config, task: Task, policy: Policy, iteration: int) -> np.ndarray:
+def evaluate(config: Config, task: Task, policy: Policy, iteration: int, stage: Stage = Stage.EVALUATE) -> np.ndarray:
     """Real returns [config.evaluation_episodes] of the deterministic policy: a record, never used to learn.
 
     One NaN for a task that only another program can play.
     """
     if not task.playable:
         return np.array([math.nan])
-    seed = int(rng_of(config.seed, iteration, Stage.EVALUATE).integers(2**31))
+    seed = int(rng_of(config.seed, iteration, stage).integers(2**31))
     return real.evaluate(task, partial(gaussian.mean, _host(policy)), config.evaluation_episodes, seed)
 
 
-def _perturbed(policy: Policy, previous: Policy, scale: float, rng: np.random.Generator) -> real.Act:
-    """The mean action of the policy with its parameters perturbed (paper, appendix A.1.1)."""
+def _perturbed(
+    policy: Policy, previous: Policy, scale: float, rng: np.random.Generator, inputs: Inputs | None = None
+) -> real.Act:
+    """The mean action of the policy with its parameters perturbed (paper, appendix A.1.1).
+
+    Those that act on normalised states: an offset of the states would blow up the noise of raw ones.
+    """
+    if inputs is not None:
+        policy, previous = unfolded(policy, inputs), unfolded(previous, inputs)
 
     def noisy(now: np.ndarray, before: np.ndarray) -> np.ndarray:
         return now + scale * np.abs(now - before) * rng.standard_normal(now.shape)
 
     perturbed = policy._replace(layers=jax.tree.map(noisy, policy.layers, previous.layers))
-    return partial(gaussian.mean, perturbed)
+    return partial(gaussian.mean, perturbed if inputs is None else folded(perturbed, inputs))
 
 
 def _row(
@@ -307,6 +337,7 @@ def _row(
     collected: float,
     fitted: FitInfo,
     improved: PhaseInfo,
+    cut: bool,
 ) -> Row:
     imagined = float(np.mean(improved.values))
     losses = np.asarray(fitted.validation_loss)
@@ -318,7 +349,7 @@ def _row(
         "return_collected": collected,
         "return_imagined": imagined,
         # What shorter episodes earn cannot be compared.
-        "gap": math.nan if config.imagine.horizon else imagined - float(np.mean(returns)),
+        "gap": math.nan if cut else imagined - float(np.mean(returns)),
         **{f"validation_loss_{k}": float(loss) for k, loss in enumerate(losses)},
         "train_loss": float(np.mean(fitted.train_loss)),
         "fit_passes": fitted.passes,

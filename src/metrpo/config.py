@@ -148,6 +148,14 @@ class PolicyConfig:
     """Sizes of the hidden layers (tanh)."""
     initial_std: float = 1.0
     """Standard deviation at the start of every policy phase."""
+    normalise: bool = False
+    """Let the policy see states normalised by the dataset, and not the dimensions that the models do not see."""
+    keep_std: bool = False
+    """Go on with the accepted policy's standard deviation in the next phase, instead of starting from initial_std."""
+    min_std: float = 0.1
+    """Least standard deviation at the start of a phase."""
+    mean_penalty: float = 0.0
+    """TRPO: taken from the surrogate, this times the squared excess of mean actions beyond [-1, 1]."""
 
     def __post_init__(self) -> None:
         _require(all(n >= 1 for n in self.hidden), "policy.hidden", self.hidden, "sizes of at least 1")
@@ -380,6 +388,10 @@ BUDGET_FIELDS = ("iterations", "real_steps")
 
 ADDED = (
     "config.fit.products",
+    "config.policy.normalise",
+    "config.policy.keep_std",
+    "config.policy.min_std",
+    "config.policy.mean_penalty",
     "config.imagine.horizon",
     "config.imagine.products",
     "config.imagine.disagreement",

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from functools import partial
+from dataclasses import replace
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -15,13 +16,14 @@ import numpy as np
 from jax.sharding import Mesh, PartitionSpec
 
 from metrpo import devices
-from metrpo.config import Config
+from metrpo.config import Config, PolicyConfig
 from metrpo.model.ensemble import Ensemble, with_products
 from metrpo.model.imagine import ImagineInfo, imagine, returns_per_model
 from metrpo.policy import gaussian
 from metrpo.policy.batch import ImproveInfo
 from metrpo.policy.gaussian import Policy
-from metrpo.policy.improve import IMPROVERS, Memory, init_memory
+from metrpo.policy.improve import IMPROVERS, Baseline, Memory, init_memory, values_at_cut
+from metrpo.policy.inputs import Inputs, folded, normalised, unfolded
 from metrpo.policy.validate import RULES, Evidence, improved
 from metrpo.types import Act, Array, Trajectories
 from metrpo.world.task import Task
@@ -61,6 +63,7 @@ def improve(
     clock: Callable[[str], AbstractContextManager[None]],
     on_validation: Callable[[int, int, float], None],
     oracle: Callable[[Policy], float],
+    inputs: Inputs | None = None,
 ) -> tuple[Policy, Array, PhaseInfo]:
     """Improves `policy` in the ensemble and returns the last accepted policy, the baseline and what happened.
 
@@ -72,13 +75,20 @@ def improve(
     ensemble = ensemble._replace(networks=with_products(ensemble.networks, config.imagine.products))
     fixed_starts = pool[rng.integers(len(pool), size=config.validate.starts)]
 
-    def judge(policy: Policy, imagined: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        horizon = imagined_horizon(config, task)
-        values = values_of(task, ensemble, policy, fixed_starts, horizon, config.imagine.disagreement)
-        return values, rule.evidence(Evidence(values, imagined, partial(oracle, policy)))
+    config = _cut_short(config, task)
 
+    def raw(policy: Policy) -> Policy:
+        return policy if inputs is None else folded(policy, inputs)
+
+    def valued(policy: Policy) -> np.ndarray:
+        return values_of(task, ensemble, policy, fixed_starts, config, inputs, memory.baseline)
+
+    def evidence(policy: Policy, imagined: np.ndarray) -> Evidence:
+        return Evidence(valued(policy), imagined, cache(lambda: oracle(raw(policy))))
+
+    policy = policy if inputs is None else unfolded(policy, inputs)
     memory = init_memory(config, policy, baseline)
-    accepted, (values, reference) = policy, judge(policy, np.array([-np.inf]))
+    accepted, reference, kept = policy, evidence(policy, np.array([-np.inf])), memory.baseline
     updates = accepted_at = 0
     infos: list[tuple[ImproveInfo, ImagineInfo]] = []
     agreed: list[np.ndarray] = []
@@ -86,23 +96,26 @@ def improve(
         block = min(config.validate.every, config.validate.max_updates - updates)
         starts = pool[rng.integers(len(pool), size=(block, rollouts(config, task)))]
         policy, memory, info = _updates(
-            task, config, ensemble, policy, memory, starts, jax.random.fold_in(key, updates)
+            task, config, ensemble, policy, memory, starts, jax.random.fold_in(key, updates), inputs
         )
         infos.append(jax.device_get(info))
         updates += block
         with clock("validate"):
-            new_values, evidence = judge(policy, _last_return(infos[-1][1]))
-        verdict = rule.decide(evidence, reference, config.validate)
-        agreed.append(improved(new_values, values))
+            found = evidence(policy, _last_return(infos[-1][1]))
+            if config.imagine.horizon is not None:
+                # The value at the cut has changed with the baseline: both policies are held against the new one.
+                reference = reference._replace(values=valued(accepted))
+        verdict = rule.decide(rule.evidence(found), rule.evidence(reference), config.validate)
+        agreed.append(improved(found.values, reference.values))
         if verdict:
-            accepted, values, reference, accepted_at = policy, new_values, evidence, updates
-        on_validation(updates, accepted_at, float(np.mean(values)))
+            accepted, reference, kept, accepted_at = policy, found, memory.baseline, updates
+        on_validation(updates, accepted_at, float(np.mean(reference.values)))
     improve_info, imagine_info = jax.tree.map(lambda *xs: np.concatenate(xs), *infos)
     return (
-        accepted,
-        memory.baseline,
+        raw(accepted),
+        kept,
         PhaseInfo(
-            values=values,
+            values=reference.values,
             updates=updates,
             accepted_updates=accepted_at,
             rejected_steps=int(np.sum(~improve_info.accepted)),
@@ -124,6 +137,17 @@ def imagined_horizon(config: Config, task: Task) -> int:
     return min(config.imagine.horizon or task.horizon, task.horizon)
 
 
+def is_cut(config: Config, task: Task) -> bool:
+    """Whether imagined episodes end before the task's do, and are valued there."""
+    return imagined_horizon(config, task) < task.horizon
+
+
+def _cut_short(config: Config, task: Task) -> Config:
+    """The config with an imagined horizon only where it cuts episodes: nothing follows a true end."""
+    horizon = imagined_horizon(config, task) if is_cut(config, task) else None
+    return replace(config, imagine=replace(config.imagine, horizon=horizon))
+
+
 def _last_return(imagined: ImagineInfo) -> np.ndarray:
     """[1]: of the last update's rollouts; where all of them diverged NaN, which is never an improvement."""
     return np.where(imagined.diverged[-1:] < 1, imagined.mean_return[-1:], np.nan)
@@ -139,17 +163,24 @@ def _compiled_updates(
     memory: Memory,
     starts: Array,
     keys: Array,
+    inputs: Inputs | None,
 ) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
     """Policy updates in one compiled call, one for each batch of start states [updates, N, S], shared by `mesh`."""
     improver = IMPROVERS[config.improver]
 
     def updates(
-        ensemble: Ensemble, policy: Policy, memory: Memory, starts: Array, keys: Array
+        ensemble: Ensemble, policy: Policy, memory: Memory, starts: Array, keys: Array, inputs: Inputs | None
     ) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
         def simulate(act: Act, starts: Array, key: Array) -> tuple[Trajectories, ImagineInfo]:
             ends, sampling = task.terminated, config.imagine.sampling
             curiosity, horizon = config.imagine.disagreement, imagined_horizon(config, task)
-            return imagine(ensemble, act, task.reward, ends, starts, horizon, key, sampling, AXIS, curiosity)
+            rollouts, info = imagine(
+                ensemble, _seeing(act, inputs), task.reward, ends, starts, horizon, key, sampling, AXIS, curiosity
+            )
+            if inputs is not None:
+                states, last = (normalised(inputs, x) for x in (rollouts.states, rollouts.last))
+                rollouts = rollouts._replace(states=states, last=last)
+            return rollouts, info
 
         def update(
             carry: tuple[Policy, Memory], given: tuple[Array, Array]
@@ -164,44 +195,75 @@ def _compiled_updates(
     return jax.shard_map(
         updates,
         mesh=mesh,
-        in_specs=(same, same, same, PartitionSpec(None, AXIS), same),
+        in_specs=(same, same, same, PartitionSpec(None, AXIS), same, same),
         out_specs=same,
         check_vma=False,
-    )(ensemble, policy, memory, starts, keys)
+    )(ensemble, policy, memory, starts, keys, inputs)
+
+
+def _seeing(act: Act, inputs: Inputs | None) -> Act:
+    return act if inputs is None else lambda states, key: act(normalised(inputs, states), key)
 
 
 def _updates(
-    task: Task, config: Config, ensemble: Ensemble, policy: Policy, memory: Memory, starts: np.ndarray, key: Array
+    task: Task,
+    config: Config,
+    ensemble: Ensemble,
+    policy: Policy,
+    memory: Memory,
+    starts: np.ndarray,
+    key: Array,
+    inputs: Inputs | None,
 ) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
     # What cannot change the compiled code (seed, budget, ...) must not cause a compilation: it is set to a constant.
     relevant = Config(
         task=task.name,
         improver=config.improver,
         imagine=config.imagine,
+        policy=PolicyConfig(mean_penalty=config.policy.mean_penalty),
         advantage=config.advantage,
         trpo=config.trpo,
         gradient=config.gradient,
         ppo=config.ppo,
     )
     mesh, keys = devices.mesh(starts.shape[1], AXIS), jax.random.split(key, len(starts))
-    ensemble, policy, memory = devices.copied((ensemble, policy, memory), mesh)
-    return _compiled_updates(task, relevant, mesh, ensemble, policy, memory, starts, keys)
+    ensemble, policy, memory, inputs = devices.copied((ensemble, policy, memory, inputs), mesh)
+    return _compiled_updates(task, relevant, mesh, ensemble, policy, memory, starts, keys, inputs)
 
 
-@partial(jax.jit, static_argnames=("task", "mesh", "horizon", "curiosity"))
+@partial(jax.jit, static_argnames=("task", "mesh", "config"))
 def _compiled_validate(
-    task: Task, mesh: Mesh, horizon: int, curiosity: float, ensemble: Ensemble, policy: Policy, starts: Array
+    task: Task,
+    mesh: Mesh,
+    config: Config,
+    ensemble: Ensemble,
+    policy: Policy,
+    starts: Array,
+    inputs: Inputs | None,
+    baseline: Baseline,
 ) -> Array:
-    def values(ensemble: Ensemble, policy: Policy, starts: Array) -> Array:
-        mine = returns_per_model(
-            ensemble, partial(gaussian.mean, policy), task.reward, task.terminated, starts, horizon, curiosity
-        )
+    horizon, curiosity = imagined_horizon(config, task), config.imagine.disagreement
+
+    def values(ensemble: Ensemble, policy: Policy, starts: Array, inputs: Inputs | None, baseline: Baseline) -> Array:
+        def seen(states: Array) -> Array:
+            return states if inputs is None else normalised(inputs, states)
+
+        def act(states: Array) -> Array:
+            return gaussian.mean(policy, seen(states))
+
+        def after(states: Array) -> Array:
+            flat = seen(states).reshape(-1, states.shape[-1])
+            return values_at_cut(config, baseline, flat).reshape(states.shape[:-1])
+
+        # Whole episodes are judged by what they earn, undiscounted; cut ones by what the updates improve.
+        cut = (config.advantage.discount, after) if is_cut(config, task) else ()
+        mine = returns_per_model(ensemble, act, task.reward, task.terminated, starts, horizon, curiosity, *cut)
         return jax.lax.pmean(mine, AXIS)
 
     same = PartitionSpec()
     return jax.shard_map(
-        values, mesh=mesh, in_specs=(same, same, PartitionSpec(AXIS)), out_specs=same, check_vma=False
-    )(ensemble, policy, starts)
+        values, mesh=mesh, in_specs=(same, same, PartitionSpec(AXIS), same, same), out_specs=same, check_vma=False
+    )(ensemble, policy, starts, inputs, baseline)
 
 
 def values_of(
@@ -209,13 +271,18 @@ def values_of(
     ensemble: Ensemble,
     policy: Policy,
     starts: np.ndarray,
-    horizon: int | None = None,
-    curiosity: float = 0.0,
+    config: Config | None = None,
+    inputs: Inputs | None = None,
+    baseline: Baseline = None,
 ) -> np.ndarray:
-    """[K]: mean return of the deterministic policy from `starts` [N, S] in each model alone.
+    """[K]: mean return of the deterministic policy from `starts` [N, S] in each model alone, as `config` imagines.
 
-    Over the task's horizon unless another is given; rewards hold `curiosity` times the models' disagreement.
+    Undiscounted over the task's horizon; where the config cuts episodes off before, discounted, with the value that
+    `baseline` gives to their last state. Rewards hold the models' disagreement where the config asks for it.
     """
+    config = config or Config(task=task.name)
+    relevant = Config(task=task.name, imagine=config.imagine, advantage=config.advantage)
     mesh = devices.mesh(len(starts), AXIS)
-    ensemble, policy = devices.copied((ensemble, policy), mesh)
-    return np.asarray(_compiled_validate(task, mesh, horizon or task.horizon, curiosity, ensemble, policy, starts))
+    given = devices.copied((ensemble, policy, inputs, baseline), mesh)
+    ensemble, policy, inputs, baseline = given
+    return np.asarray(_compiled_validate(task, mesh, relevant, ensemble, policy, starts, inputs, baseline))

@@ -70,7 +70,9 @@ def normaliser_of(
     def std(x: Array, floor: float = std_floor) -> Array:
         return np.maximum(np.std(np.asarray(x), axis=0, dtype=np.float64), floor)
 
-    state_scale = 1 / std(train.states)
+    # What does not vary, to float32's precision, has nothing to tell: a tiny divisor would only blow up rounding.
+    constant = std(train.states, 0.0) <= 1e-6 * np.abs(np.mean(np.asarray(train.states), axis=0, dtype=np.float64))
+    state_scale = np.where(constant, 0.0, 1 / std(train.states))
     state_scale[list(unseen)] = 0.0
     return Normaliser(
         state_mean=mean(train.states),

@@ -5,7 +5,6 @@ Paper, section 4.1 (the L2 one-step loss) and appendix A.1.2 (batch, passes, pat
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -64,12 +63,14 @@ def fit(
     train, validation = devices.copied(train, mesh), devices.copied(validation, mesh)
     # At least one step a pass: the first iterations of a small task may have fewer transitions than a minibatch.
     steps_per_pass = max(1, int(train.size) // config.batch_size)
-    steps = steps_per_pass * config.validate_every
-    max_passes = min(config.max_passes, (config.max_steps or math.inf) / steps_per_pass)
-    passes = 0
-    while passes < max_passes and passes - int(at.best_pass.max()) < config.patience:
-        passes += config.validate_every
-        counts = jnp.int32(steps), jnp.int32(passes)
+    most = config.max_passes * steps_per_pass
+    most = most if config.max_steps is None else min(most, config.max_steps)
+    steps = passes = 0
+    while steps < most and passes - int(at.best_pass.max()) < config.patience:
+        block = min(config.validate_every * steps_per_pass, most - steps)
+        steps += block
+        passes = -(-steps // steps_per_pass)
+        counts = jnp.int32(block), jnp.int32(passes)
         at = train_and_validate(at, normaliser, train, validation, config, mesh, key, *counts)
         on_validation(passes, at.best_loss)
     diverged = ~(_finite(at.networks) & np.isfinite(at.train_loss))

@@ -227,15 +227,18 @@ def returns_per_model(
     starts: Array,
     horizon: int,
     curiosity: float = 0.0,
+    discount: float = 1.0,
+    after: Callable[[Array], Array] | None = None,
 ) -> Array:
-    """[K]: mean return of the deterministic policy `act`, full horizon from `starts` [N, S], in each model alone.
+    """[K]: mean return of the deterministic policy `act` in `horizon` steps from `starts` [N, S], in each model alone.
 
-    Rewards hold `curiosity` times the models' disagreement.
+    Rewards hold `curiosity` times the models' disagreement. What follows the last step is worth `after` of its state,
+    [..., S] -> [...]; without `after`, nothing.
 
     NaN for a model in which any rollout diverged: such a model cannot vouch for the policy.
     """
 
-    def step(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], None]:
+    def step(carry: tuple[Array, Array, Array], weight: Array) -> tuple[tuple[Array, Array, Array], None]:
         states, alive, total = carry
         actions = jnp.clip(act(states), -1.0, 1.0)
         predicted = predict(ensemble, states, actions)
@@ -245,12 +248,15 @@ def returns_per_model(
             rewards = rewards + curiosity * disagreement(ensemble, *flat).reshape(rewards.shape)
         sound = _sound(following, rewards)
         # A product with `alive` would let what follows the end through: 0 * inf is NaN.
-        total = total + jnp.where(alive > 0, jnp.where(sound, rewards, jnp.nan), 0.0)
+        total = total + jnp.where(alive > 0, jnp.where(sound, weight * rewards, jnp.nan), 0.0)
         if ended is not None:
             alive = alive * (1.0 - ended)
         return (following, alive, total), None
 
     states = _for_all(ensemble, starts)
     zeros = jnp.zeros(states.shape[:2])
-    (_, _, total), _ = jax.lax.scan(step, (states, zeros + 1.0, zeros), None, length=horizon)
+    weights = jnp.float32(discount) ** jnp.arange(horizon)
+    (states, alive, total), _ = jax.lax.scan(step, (states, zeros + 1.0, zeros), weights)
+    if after is not None:
+        total = total + jnp.where(alive > 0, discount**horizon * after(states), 0.0)
     return jnp.mean(total, axis=1)

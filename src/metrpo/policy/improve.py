@@ -55,6 +55,13 @@ def init_memory(config: Config, policy: Policy, baseline: Baseline) -> Memory:
     return Memory(baseline, () if config.improver == "trpo" else init_moments(policy, config.gradient))
 
 
+def values_at_cut(config: Config, baseline: Baseline, states: Array) -> Array:
+    """What `baseline` says of the states [N, S] in which imagined episodes are cut off, whatever the time: [N]."""
+    if config.advantage.baseline == "network":
+        return value.predict(baseline, value.inputs(states[None], timeless=True)[0])
+    return advantage.features(states[None], timeless=True)[0] @ baseline
+
+
 def batch_of(
     config: Config, rollouts: Trajectories, baseline: Baseline, key: Array, axis: str | None = None
 ) -> tuple[Batch, Baseline]:
@@ -125,7 +132,7 @@ def _through_models(act: Callable[[Policy], Act]) -> Improver:
 def _trpo(
     config: Config, policy: Policy, moments: Any, batch: Batch, key: Array, axis: str | None
 ) -> tuple[Policy, Any, ImproveInfo]:
-    new, info = trpo.improve(policy, batch, config.trpo, axis)
+    new, info = trpo.improve(policy, batch, config.trpo, axis, config.policy.mean_penalty)
     return new, moments, info
 
 

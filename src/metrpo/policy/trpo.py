@@ -18,16 +18,23 @@ from metrpo.policy.linearised import Linearised, chunked, forward, gauss_newton,
 from metrpo.types import Array
 
 
-def improve(policy: Policy, batch: Batch, config: TRPOConfig, axis: str | None = None) -> tuple[Policy, ImproveInfo]:
+def improve(
+    policy: Policy, batch: Batch, config: TRPOConfig, axis: str | None = None, penalty: float = 0.0
+) -> tuple[Policy, ImproveInfo]:
     """One TRPO update on `batch`; the policy stays as it is when no step of the line search improves within max_kl.
 
-    With `axis`, `batch` is this device's share of the batch (see `metrpo.devices`).
+    The surrogate loses `penalty` times the squared excess of mean actions beyond [-1, 1]: clipped actions have no
+    gradient that could bring them back. With `axis`, `batch` is this device's share of the batch (see
+    `metrpo.devices`).
     """
     states, actions, advantages, mask = (chunked(x) for x in batch)
     count = jnp.maximum(across(jnp.sum(mask), axis), 1.0)
     weights = mask * advantages / count
     old_log_std = policy.log_std[:, None]
     at = linearise(policy.layers, states)
+
+    def cost(means: Array, mask: Array) -> Array:
+        return penalty / count * jnp.sum(mask * jnp.square(_excess(means))) if penalty else jnp.float32(0)
 
     def surrogate_and_kl(new: Policy) -> tuple[Array, Array]:
         log_std = new.log_std[:, None]
@@ -39,7 +46,8 @@ def improve(policy: Policy, batch: Batch, config: TRPOConfig, axis: str | None =
                 old_means, old_log_std, actions, 0
             )
             divergence = gaussian.kl(old_means, old_log_std, means, log_std, 0)
-            return (total[0] + jnp.sum(weights * jnp.exp(log_ratio)), total[1] + jnp.sum(mask * divergence)), None
+            gain = jnp.sum(weights * jnp.exp(log_ratio)) - cost(means, mask)
+            return (total[0] + gain, total[1] + jnp.sum(mask * divergence)), None
 
         zero = (jnp.float32(0), jnp.float32(0))
         surrogate, divergence = across(jax.lax.scan(add, zero, (states, actions, at.means, weights, mask))[0], axis)
@@ -47,9 +55,10 @@ def improve(policy: Policy, batch: Batch, config: TRPOConfig, axis: str | None =
 
     # The surrogate's gradient at the old policy, where every ratio is 1.
     z = (actions - at.means) * jnp.exp(-old_log_std)
-    slope = Policy(
-        pull_back(at, weights * z * jnp.exp(-old_log_std)), jnp.sum(weights * (jnp.square(z) - 1.0), axis=(0, 2))
-    )
+    rising = weights * z * jnp.exp(-old_log_std)
+    if penalty:
+        rising = rising - 2 * penalty / count * mask * _excess(at.means)
+    slope = Policy(pull_back(at, rising), jnp.sum(weights * (jnp.square(z) - 1.0), axis=(0, 2)))
     flat, unravel = ravel_pytree(policy)
     gradient = ravel_pytree(across(slope, axis))[0]
     if (every := config.fisher_every) > 1:
@@ -63,7 +72,7 @@ def improve(policy: Policy, batch: Batch, config: TRPOConfig, axis: str | None =
     # F x = g - residual, so x'Fx needs no further product.
     curvature = jnp.dot(direction, gradient - residual)
     step = direction * jnp.sqrt(2 * config.max_kl / jnp.maximum(curvature, 1e-12))
-    start = across(jnp.sum(weights), axis)
+    start = across(jnp.sum(weights) - cost(at.means, mask), axis)
 
     def attempt(i: Array) -> tuple[Array, Array, Array]:
         candidate = flat + config.backtrack_ratio**i * step
@@ -88,6 +97,11 @@ def improve(policy: Policy, batch: Batch, config: TRPOConfig, axis: str | None =
         backtracks=tries,
         cg_residual=jnp.linalg.norm(residual) / jnp.maximum(norm, 1e-30),
     )
+
+
+def _excess(means: Array) -> Array:
+    """How far mean actions lie beyond [-1, 1], signed."""
+    return means - jnp.clip(means, -1.0, 1.0)
 
 
 def fisher_product(
