@@ -305,6 +305,29 @@ def test_the_environment_is_ready_before_jax(monkeypatch, tmp_path):
     assert os.environ["JAX_PLATFORMS"] == "cpu"
 
 
+def test_a_gpu_multiplies_in_float32_unless_told_otherwise(monkeypatch, tmp_path):
+    for name in ("JAX_PLATFORMS", "XLA_FLAGS", "NPROC", "JAX_COMPILATION_CACHE_DIR", "JAX_DEFAULT_MATMUL_PRECISION"):
+        monkeypatch.setenv(name, "")  # put back at the end
+        monkeypatch.delenv(name)
+    monkeypatch.setattr(machine, "_require_gpu", lambda: None)
+    machine.prepare("cpu", deterministic=False)
+    assert "JAX_DEFAULT_MATMUL_PRECISION" not in os.environ
+    machine.prepare("gpu", deterministic=False)
+    assert os.environ["JAX_DEFAULT_MATMUL_PRECISION"] == "highest"
+    monkeypatch.setenv("JAX_DEFAULT_MATMUL_PRECISION", "tensorfloat32")
+    machine.prepare("gpu", deterministic=False)
+    assert os.environ["JAX_DEFAULT_MATMUL_PRECISION"] == "tensorfloat32"
+
+
+@pytest.mark.parametrize("cuda", [12, 13])
+def test_either_cuda_plugin_is_a_gpu_that_jax_may_use(monkeypatch, cuda):
+    monkeypatch.setattr(machine, "has_nvidia", lambda: True)
+    monkeypatch.setattr(machine, "find_spec", lambda name: name == f"jax_cuda{cuda}_plugin" or None)
+    assert machine._may_have_gpu()
+    monkeypatch.setattr(machine, "has_nvidia", lambda: False)
+    assert not machine._may_have_gpu() or os.path.exists("/dev/kfd") or sys.platform != "linux"
+
+
 def test_deterministic_leaves_xla_one_thread():
     code = (
         "import os; from metrpo.run.machine import prepare; prepare('cpu', True); "

@@ -29,7 +29,8 @@ def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
 
     Must run before JAX and NumPy are imported. A CPU becomes one JAX device per core, up to 8, which share the
     imagined rollouts (see `metrpo.devices`); `deterministic` takes XLA down to one device and one thread. Compiled code
-    is kept between processes in $JAX_COMPILATION_CACHE_DIR (default: metrpo/jax in the user's cache directory).
+    is kept between processes in $JAX_COMPILATION_CACHE_DIR (default: metrpo/jax in the user's cache directory). Where
+    there may be a GPU, float32 products are taken in float32 ($JAX_DEFAULT_MATMUL_PRECISION says otherwise).
 
     Raises `MetrpoError` when `device` is "gpu" and JAX finds none.
     """
@@ -45,6 +46,10 @@ def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
         _add_flags(f"--xla_force_host_platform_device_count={min(cores(), MAX_CPU_DEVICES)}")
     if "xla_cpu_collective" not in os.environ.get("XLA_FLAGS", ""):
         _add_flags(*PATIENT)
+    if device == "gpu" or (device is None and _may_have_gpu()):
+        # By itself JAX multiplies float32 matrices in TF32 there, whose 10 bits conjugate gradients and line search do
+        # not survive.
+        os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
@@ -88,7 +93,7 @@ def _require_gpu() -> None:
 def _may_have_gpu() -> bool:
     return (
         sys.platform != "linux"
-        or (has_nvidia() and find_spec("jax_cuda12_plugin") is not None)
+        or (has_nvidia() and any(find_spec(f"jax_cuda{cuda}_plugin") is not None for cuda in (12, 13)))
         or Path("/dev/kfd").exists()
     )
 
