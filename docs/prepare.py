@@ -138,11 +138,13 @@ def check() -> Links:
 
 
 def commands() -> str:
-    """A section for every command that the parser knows: what --help prints, without its boxes."""
+    """All commands in short, and a section for each: what --help-all prints, without its boxes."""
     from metrpo import options
+    from metrpo.helptext import overview
 
     names = [command.__name__.lower() for command in typing.get_args(options.Command)]
-    return "\n".join(_command(name, _help(options.parse, name)) for name in names)
+    sections = (_command(name, _help(options.parse, name)) for name in names)
+    return "\n".join([f"```text\n{overview()}\n```\n", *sections])
 
 
 def _help(parse: typing.Callable[[list[str]], object], name: str) -> str:
@@ -151,7 +153,7 @@ def _help(parse: typing.Callable[[list[str]], object], name: str) -> str:
     os.environ["COLUMNS"] = str(WIDTH)
     try:
         with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-            parse([name, "--help"])
+            parse([name, "--help-all"])
     finally:
         os.environ.pop("COLUMNS") if before is None else os.environ.update(COLUMNS=before)
     printed.seek(0)

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -17,6 +18,7 @@ import pytest
 import metrpo
 from metrpo.cli import main
 from metrpo.config import Config
+from metrpo.options import COMMANDS
 from metrpo.presets import preset
 from metrpo.run import directory, doctor, machine
 from metrpo.run.directory import RunDirectory
@@ -116,8 +118,18 @@ def test_settings_start_from_the_preset_of_the_task():
 WRONG = [
     (["train", "Swimer"], "unknown task 'Swimer': did you mean Swimmer"),
     (["train", "Swimmer", "--ensemble.members", "0"], "ensemble.members: expected at least 1, got 0"),
-    (["train", "Swimmer", "--ensemble.members", "many"], "--ensemble.members"),
-    (["train", "Swimmer", "--ensemble.member", "3"], "--ensemble.members INT"),
+    (["train", "Swimmer", "--ensemble.members", "many"], "--ensemble.members: expected a whole number, got many"),
+    (["train", "Swimmer", "--trpo.maxkl", "3"], "unknown option --trpo.maxkl, did you mean --trpo.max-kl?"),
+    (["train", "Swimmer", "--max_kl=3"], "unknown option --max_kl, did you mean --trpo.max-kl?"),
+    (["train", "Swimmer", "--no-vido"], "did you mean --no-video?"),
+    (["train", "Swimmer", "Ant"], "expected fewer words"),
+    (["train", "Swimmer", "--system", "pop"], "validate-real, validate-trpo_mean"),
+    (["trian", "Swimmer"], "unknown command 'trian', did you mean train?"),
+    (["zzz"], "unknown command 'zzz'; metrpo --help lists them"),
+    (["--seed", "3", "train"], "expected a command before --seed"),
+    (["sweep", "--jobs", "all"], "--jobs: expected a whole number, got all"),
+    (["sweep", "--seed", "0"], "did you mean --seeds?"),
+    (["train", "Swimmer", "--ensemble.member", "3"], "--ensemble.member, did you mean --ensemble.members?"),
     (["train", "Swimmer", "--trpo.max-kl", "nan"], "trpo.max_kl: expected a finite number > 0, got nan"),
     (["train", "Swimmer", "--preset", "slow"], "--preset"),
     (["train", "Swimmer", "--config.task", "Ant"], "--config.task"),
@@ -138,7 +150,7 @@ def test_wrong_input_is_one_message_and_exit_code_2(capsys, tmp_path, arguments,
     out, err = capsys.readouterr()
     assert message in err
     assert out == ""
-    assert "Traceback" not in err
+    assert err.count("\n") == err.count("metrpo: ") == 1, "said once, and in one line"
     assert not any(tmp_path.iterdir())
 
 
@@ -240,19 +252,65 @@ def test_doctor_finds_what_is_here_and_what_is_missing(capsys, monkeypatch):
     assert "training cannot work here" in out
 
 
-@pytest.mark.parametrize("command", ["", "train", "evaluate", "render", "tasks", "doctor"])
+@pytest.mark.parametrize("command", ["", *COMMANDS])
 def test_every_help_has_examples(capsys, command):
     assert run(*command.split(), "--help") == 0
     out = capsys.readouterr().out
     assert f"metrpo {command or 'train Swimmer'}" in out.replace("usage: metrpo", "")
-    assert "(default: " in out or not command
+    examples = [line for line in out.splitlines() if line.startswith("    metrpo ")]
+    assert all(len(line) <= 80 for line in examples), "to be copied, an example must not be wrapped"
+    assert len(examples) >= bool(command)
+
+
+def test_the_list_of_commands_fits_a_screen_and_names_all(capsys):
+    assert run("--help") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 80
+    rows = [line for line in lines[1:] if line[13:14] == " " and line[14:15].isalpha()]
+    assert sorted(line[14:].split()[0] for line in rows) == sorted(COMMANDS)
+
+
+def options_in(text):
+    return re.findall(r"^\W{1,4}(--\w[\w.-]+)", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("command", ["train", "init"])
+def test_help_shows_what_people_use_and_help_all_the_rest(capsys, monkeypatch, command):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert run(command, "Swimmer", "--help") == 0
+    few = options_in(text := capsys.readouterr().out)
+    assert 9 <= len(few) <= 12
+    assert {"--seed", "--iterations", "--real-steps", "--preset", "--system", "--run-dir", "--device"} <= set(few)
+    assert f"metrpo {command} --help-all" in text
+    assert run(command, "Swimmer", "--help-all") == 0
+    assert len(options_in(capsys.readouterr().out)) > 50
+    assert run("evaluate", "--help-all") == 0, "the same as --help"
+    assert "--episodes" in capsys.readouterr().out
+
+
+def test_switches_and_methods_read_the_right_way(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    for command, option, meaning in (
+        ("train", "--no-video", "Do not record"),
+        ("reproduce", "--no-run", "Run nothing"),
+        ("bench", "--no-iterations", "Do not time"),
+    ):
+        assert run(command, "--help") == 0
+        text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+        assert f"{option} {meaning}" in text
+        assert not re.search(r"\(default: (None|True|False)\)", text)
+    assert run("train", "--help-all") == 0
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "ppo and ddpg are Stable-Baselines3's" in text, "the system"
+    assert "This ppo is ours, within the ensemble" in text, "the improver"
 
 
 def test_help_shows_the_defaults_of_task_and_preset(capsys):
-    assert run("train", "Humanoid", "--preset", "paper", "--help") == 0
+    assert run("train", "Humanoid", "--preset", "paper", "--help-all") == 0
     out = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "(default: 100 50 25)" in out
-    assert run("train", "Swimmer", "--help") == 0
+    assert run("train", "Swimmer", "--help-all") == 0
     assert "(default: 32 32)" in " ".join(capsys.readouterr().out.replace("│", " ").split())
 
 

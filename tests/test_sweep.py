@@ -71,6 +71,56 @@ def test_what_is_run_is_what_the_grid_says(monkeypatch):
         assert Config(**{f.name: getattr(typed, f.name) for f in dataclasses.fields(Config)}) == run.config
 
 
+def told(line):
+    """The grid of a command line."""
+    return sweep.as_typed(options.parse(["sweep", *line.split()]))
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ("--set ensemble.members=1,2 trpo.max_kl=0.1", "--set ensemble.members=1,2 --jobs 2 --set trpo.max_kl=0.1"),
+        ("--set ensemble.members=1,2 trpo.max_kl=0.1", "--set=ensemble.members=1,2 --set=trpo.max_kl=0.1"),
+        ("--tasks Swimmer Snake", "--tasks Swimmer --tasks Snake"),
+        ("--systems k-1 k-10 --seeds 0", "--systems k-1 --seeds 0 --systems k-10"),
+        ("--seeds 0 1 2 5", "--seeds 0:3 --seeds 5", "--seeds 0:3,5", "--seeds=0,1 --seeds 2,5 1"),
+    ],
+)
+def test_lists_may_be_given_at_once_or_one_by_one(lines):
+    first, *others = map(told, lines)
+    assert len(first.runs()) > 1
+    for other in others:
+        assert other == first
+
+
+def test_a_setting_is_given_once():
+    with pytest.raises(ConfigError, match=r"set: expected each setting once, got trpo.max_kl, trpo.max_kl"):
+        told("--set trpo.max_kl=0.1 --set trpo.max_kl=0.2")
+
+
+def test_a_budget_is_each_runs_and_names_no_folder(tmp_path):
+    usual = told("--seeds 0").runs()
+    for name in ("iterations", "real_steps"):
+        runs = told(f"--seeds 0 --{name.replace('_', '-')} 7000").runs()
+        assert [getattr(run.config, name) for run in runs] == [7000]
+        assert [run.name for run in runs] == [run.name for run in usual], "a larger budget goes on with the same runs"
+        assert f"--{name.replace('_', '-')} 7000" in " ".join(runs[0].arguments)
+        (tmp_path / "grid.toml").write_text(f'tasks = ["Swimmer"]\nseeds = [0]\n{name} = 7000')
+        assert from_file(tmp_path / "grid.toml").runs() == runs
+    for words in ("--iterations 3 --real-steps 4", "--iterations 3 --set real_steps=100"):
+        with pytest.raises(ConfigError, match=r"not allowed together|leave one out"):
+            told(words).runs()
+    (tmp_path / "grid.toml").write_text('tasks = ["Swimmer"]\niterations = 3\nreal_steps = 4')
+    with pytest.raises(ConfigError, match="got both"):
+        from_file(tmp_path / "grid.toml").runs()
+
+
+def test_a_file_stands_alone():
+    with pytest.raises(ConfigError, match=r"seeds: expected it in grid\.toml alone"):
+        options.parse(["sweep", "grid.toml", "--seeds", "3"])
+    assert options.parse(["sweep", "grid.toml", "--jobs", "3", "--out", "a", "--dry-run"]).dry_run
+
+
 @pytest.mark.parametrize(
     ("grid", "message"),
     [

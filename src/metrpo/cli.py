@@ -295,14 +295,9 @@ def _json(numbers: Mapping[str, float | None]) -> str:
 
 def _sweep(command: Sweep) -> int:
     from metrpo.experiments.reproduce import reproduce
-    from metrpo.experiments.sweep import Grid, from_file, seeds_of, values_of
+    from metrpo.experiments.sweep import as_typed, from_file
 
-    if command.spec is not None:
-        grid = from_file(command.spec)
-    else:
-        settings = dict(values_of(text) for text in command.set)
-        grid = Grid(command.tasks, command.systems, seeds_of(command.seeds), command.preset, settings)
-    runs = grid.runs()
+    runs = (as_typed(command) if command.spec is None else from_file(command.spec)).runs()
     print(f"{command.out}: {len(runs)} runs", flush=True)
     if command.dry_run:
         for run in runs:

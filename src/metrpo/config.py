@@ -240,7 +240,7 @@ class GradientConfig:
 
 @dataclass(frozen=True)
 class PPOConfig:
-    """Proximal policy optimization in imagination (Schulman et al. 2017), for `improver = "ppo"`."""
+    """Proximal policy optimization on imagined steps (Schulman et al. 2017), for `improver = "ppo"`."""
 
     clip: float = 0.2
     """Probability ratios beyond 1 +- clip earn nothing more."""
@@ -353,8 +353,8 @@ class Config:
     """The loop: in the ensemble (the paper's Algorithms 1 and 2), or a baseline in the real environment: TRPO,
     Stable-Baselines3's PPO and DDPG, stochastic value gradients."""
     improver: Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic"] = "trpo"
-    """How the policy is improved in the ensemble: by the score function (trpo, ppo, vpg) or by backpropagation through
-    the models, of the mean action or of reparametrised samples."""
+    """How the policy is improved on imagined steps: by the score function (trpo, ppo, vpg) or by backpropagation
+    through the models, of the mean action or of reparametrised samples. This ppo is ours; the system ppo is another."""
     learn_reward: bool = False
     """Learn the reward and the end of episodes even where the task has formulas for them."""
     trust_reward: bool = False

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
+import typing
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Any, Literal, NoReturn, cast
 
 import tyro
-from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg, subcommand
+from tyro.conf import FlagCreatePairsOff, OmitArgPrefixes, OmitSubcommandPrefixes, Positional, arg
 
 from metrpo.config import Config, Preset, System
-from metrpo.errors import ConfigError
+from metrpo.errors import ConfigError, MetrpoError
 from metrpo.experiments.means import Means
+from metrpo.helptext import FEW, overview, shown
+from metrpo.words import command_of, joined, lists_of, understood
 
 _BUDGET = tyro.conf.create_mutex_group(required=False)
 
@@ -25,10 +28,18 @@ class Run(Config):
     task: Annotated[Positional[str], arg(metavar="TASK")] = "Swimmer"
     """Name of the task (see: metrpo tasks), a Gymnasium id, module:name or path/to/file.py:name."""
     preset: Preset = "fast"
-    """What all other settings start from: the paper's values, what learns soonest on two CPU cores, or short imagined
-    episodes valued at their end by a network, for tasks of 1,000 steps."""
-    system: System = "me-trpo"
-    """Which of the paper's systems: they differ from me-trpo in a few settings each (see metrpo.systems)."""
+    """What all other settings start from. fast: learns soonest on two CPU cores; paper: the paper's values;
+    long-horizon: for tasks of 1,000 steps."""
+    system: Annotated[System, arg(metavar="NAME")] = "me-trpo"
+    """The method: me-trpo, or one to compare it with. trpo, ppo, ddpg, svg-1 and svg-inf learn without the ensemble:
+    trpo, ppo and ddpg on real steps alone (ppo and ddpg are Stable-Baselines3's). Others, such as model-ppo and k-1,
+    change a few settings of me-trpo."""
+    method: Annotated[Literal["model-based", "trpo", "ppo", "ddpg", "svg"], arg(metavar="NAME")] = "model-based"
+    """The loop, which --system chooses: model-based (the paper's), or a baseline: trpo, Stable-Baselines3's ppo and
+    ddpg, svg."""
+    improver: Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic"] = "trpo"
+    """How the policy is improved on imagined steps: by score functions (trpo, ppo, vpg) or through the models
+    (bptt). This ppo is ours, within the ensemble; --ppo.clip and the like are its settings."""
     iterations: Annotated[int, _BUDGET] = 10
     """Outer iterations; may be raised later to go on with a finished run."""
     real_steps: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
@@ -36,37 +47,37 @@ class Run(Config):
     data: Annotated[str | None, arg(metavar="FILE")] = None
     """Logged transitions to begin with: minari:NAME or an .npz of states, actions, rewards, next_states, terminated."""
     run_dir: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Where the run lives; default: runs/<task>-[<system>-]<preset>-seed<seed>."""
+    """Where the run lives; default: runs/TASK-[SYSTEM-]PRESET-seedSEED, and the settings that are not the preset's."""
     device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="{cpu,gpu}")] = None
     """Where JAX computes; default: a GPU if JAX can use one."""
 
 
 @dataclass(frozen=True)
 class Train(Run):
-    """Learn a task, or go on with a run: the same command on the same directory resumes it.
+    """Learn a task, or go on with a run: the same command again resumes it.
 
-    Every setting below starts from the task's preset. For example:
+    For example:
         metrpo train Swimmer
         metrpo train HalfCheetah --seed 1 --real-steps 60000 --run-dir runs/cheetah
-        metrpo train Swimmer --system ppo
-        metrpo train Swimmer --data log.npz --real-steps 0 --run-dir runs/offline
-        metrpo train Pendulum-v1                          # any Gymnasium id; reward and end are learned
-        metrpo train path/to/file.py:task                 # a task or a function that makes an environment
-        metrpo train Swimmer --preset paper --ensemble.members 10 --trpo.max-kl 0.02 --ensemble.hidden 512 512
+        metrpo train Pendulum-v1 --ensemble.members 10 --trpo.max-kl 0.02
+
+    Every setting starts from the task's preset; metrpo train --help-all lists all.
     """
 
-    video: bool = True
-    """Record the final policy when all is done."""
+    video: Annotated[bool, arg(help="Do not record the final policy as a video.")] = True
 
 
 @dataclass(frozen=True)
 class Init(Run):
     """Start a run whose episodes another program plays: a robot's own, say. Takes the same settings as train.
 
-    It writes the untrained policy. Then, again and again: play DIR's policy, add the episodes, improve. For example:
+    It writes the untrained policy. Then, again and again: play DIR's policy, add
+    the episodes (or call metrpo.append_episode in the program), improve. For example:
         metrpo init path/to/arm.py:task --run-dir runs/arm
-        metrpo collect runs/arm --data today.npz          # or metrpo.append_episode in the robot's program
+        metrpo collect runs/arm --data today.npz
         metrpo improve runs/arm
+
+    Every setting starts from the task's preset; metrpo init --help-all lists all.
     """
 
 
@@ -74,10 +85,11 @@ class Init(Run):
 class Collect:
     """Add real episodes to a run, which its next iteration learns from; one that was stopped goes on.
 
-    They are on disk as soon as they end. For example:
-        metrpo collect runs/arm                           # plays the task's environment with exploration
+    It plays the task's environment with exploration, or takes episodes that were
+    recorded elsewhere. They are on disk as soon as they end. For example:
+        metrpo collect runs/arm
         metrpo collect runs/arm --steps 1000
-        metrpo collect runs/arm --data today.npz          # episodes that were recorded elsewhere
+        metrpo collect runs/arm --data today.npz
     """
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
@@ -201,8 +213,7 @@ class Bench:
     """Measure mbrl-lib, sb3-contrib and PyTorch too; the first time installs them (gigabytes), apart from ours."""
     rounds: int = 7
     """How often each piece is timed."""
-    iterations: bool = True
-    """Time whole outer iterations and the start of a process too (minutes)."""
+    iterations: Annotated[bool, arg(help="Do not time whole outer iterations and process starts (minutes).")] = True
     json: bool = False
     """Print JSON."""
 
@@ -218,9 +229,9 @@ class Reproduce:
     FIGURE is comparison, optimizers, ensemble-size, overfitting, sampling, validation, wall-clock, or all. Finished
     runs are kept, stopped ones go on, and the figure shows what there is. For example:
         metrpo reproduce all --scale smoke
-        metrpo reproduce optimizers --scale laptop --tasks Swimmer --seeds 3 --jobs 2
-        metrpo reproduce all --scale laptop --no-run      # draws only
-        metrpo reproduce all --scale paper --backend ray --gpus 1 --out /shared/paper
+        metrpo reproduce optimizers --tasks Swimmer --seeds 3 --jobs 2
+        metrpo reproduce all --scale laptop --no-run
+        metrpo reproduce all --scale paper --backend ray --out /shared/paper
     """
 
     figure: Annotated[Positional[str], arg(metavar="FIGURE")]
@@ -233,8 +244,7 @@ class Reproduce:
     """Seeds 0, 1, ... of each system; default: the scale's."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of the runs and of figures/; default: runs/reproduce-<scale>."""
-    run: bool = True
-    """Run what is missing."""
+    run: Annotated[bool, arg(help="Run nothing: draw what is there.")] = True
     json: bool = False
     """Print the figures' numbers as JSON."""
     means: Annotated[Means, OmitArgPrefixes] = field(default_factory=Means)
@@ -248,11 +258,13 @@ class Reproduce:
 class Sweep:
     """Run a grid: every task with every system, seed and combination of settings, each an ordinary `metrpo train`.
 
-    Finished runs are kept, stopped ones go on, a run that fails does not stop the others. For example:
+    Finished runs are kept, stopped ones go on, a run that fails does not stop the
+    others. Lists may be given at once (--set A B) or one by one (--set A --set B).
+    For example:
         metrpo sweep --tasks Swimmer HalfCheetah --seeds 0:5 --out runs/seeds
-        metrpo sweep --tasks Swimmer --set ensemble.members=1,5,10 trpo.max_kl=0.01,0.03 --seeds 0:3 --jobs 4
+        metrpo sweep --set ensemble.members=1,5,10 trpo.max_kl=0.01,0.03 --jobs 4
         metrpo sweep grid.toml --dry-run
-        metrpo sweep grid.toml --backend ray --out /shared/sweep      # on a Ray cluster: docs/many-runs.md
+        metrpo sweep grid.toml --backend ray --out /shared/sweep
 
     where grid.toml holds, say:
         tasks = ["Swimmer"]
@@ -261,22 +273,30 @@ class Sweep:
     """
 
     spec: Annotated[Positional[Path | None], arg(metavar="SPEC")] = None
-    """The grid as a TOML file: tasks, systems, seeds, preset and a table [set]; instead of the options below."""
-    tasks: tuple[str, ...] = ("Swimmer",)
+    """The grid as a TOML file: tasks, systems, seeds, iterations or real_steps, preset and a table [set]; instead of
+    the options of these names."""
+    tasks: Annotated[tuple[str, ...], arg(metavar="TASK...")] = ("Swimmer",)
     """Tasks, as metrpo train takes them."""
-    systems: tuple[System, ...] = ("me-trpo",)
+    systems: Annotated[tuple[System, ...], arg(metavar="NAME...")] = ("me-trpo",)
     """Systems, as metrpo train takes them."""
-    seeds: str = "0:3"
-    """Seeds: a number, a range such as 0:5 (0 to 4), or a list such as 0,2,7."""
+    seeds: Annotated[tuple[str, ...], arg(metavar="SEEDS...")] = ("0:3",)
+    """Seeds: numbers, ranges such as 0:5 (0 to 4), or lists such as 0,2,7."""
+    iterations: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
+    """Outer iterations of every run; default: the preset's. May be raised later to go on with finished runs."""
+    real_steps: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
+    """Instead of --iterations: real steps of every run."""
     preset: Preset = "fast"
     """What all other settings start from."""
-    set: tuple[str, ...] = ()
+    set: Annotated[tuple[str, ...], arg(metavar="NAME=VALUES...")] = ()
     """Settings and their values: ensemble.members=1,5,10 or ensemble.hidden=[200,200],[512]."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("runs/sweep")
     """Folder of the runs: <task>/<system>,<setting>=<value>/seed-<seed>."""
     dry_run: bool = False
     """Only say what would be run."""
     means: Annotated[Means, OmitArgPrefixes] = field(default_factory=Means)
+
+    def __post_init__(self) -> None:
+        _require_file_alone(self, self.spec, apart=("spec", "out", "dry_run", "means"))
 
 
 @dataclass(frozen=True)
@@ -285,8 +305,8 @@ class Tune:
 
     Give several seeds: what one run earns is noise. The same command goes on. Needs: pip install 'metrpo[tune]'.
     For example:
-        metrpo tune --task Swimmer --search "trpo.max_kl=log 0.003..0.1" --search "ensemble.members=1,3,5"
-        metrpo tune --search "policy.initial_std=0.5..3" --search "validate.patience=10..50 step 10" --dry-run
+        metrpo tune --search "trpo.max_kl=log 0.003..0.1" ensemble.members=1,3,5
+        metrpo tune --search "validate.patience=10..50 step 10" --dry-run
         metrpo tune search.toml --jobs 2 --out runs/tune-Swimmer
 
     where search.toml holds, say:
@@ -302,19 +322,19 @@ class Tune:
     and tables [search] and [set]; instead of the options of these names."""
     task: str = "Swimmer"
     """Task, as metrpo train takes it."""
-    search: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, arg(metavar="NAME=RANGE")] = ()
-    """A setting and its range, A..B, log A..B or A..B step C, or its choices, such as 1,3,5 or [64],[200,200]."""
-    set: Annotated[tuple[str, ...], tyro.conf.UseAppendAction, arg(metavar="NAME=VALUE")] = ()
-    """Another setting that is not the preset's."""
+    search: Annotated[tuple[str, ...], arg(metavar="NAME=RANGE...")] = ()
+    """Settings, each with its range, A..B, log A..B or A..B step C, or its choices, such as 1,3,5 or [64],[200,200]."""
+    set: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE...")] = ()
+    """Other settings that are not the preset's."""
     trials: int = 20
     """Trials in all; may be raised later."""
-    seeds: str = "0:2"
-    """Seeds of every trial, side by side: a number, a range such as 0:3 (0 to 2), or a list such as 0,2,7."""
+    seeds: Annotated[tuple[str, ...], arg(metavar="SEEDS...")] = ("0:2",)
+    """Seeds of every trial, side by side: numbers, ranges such as 0:3 (0 to 2), or lists such as 0,2,7."""
     iterations: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
     """Outer iterations of every run; default: the preset's."""
     real_steps: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
     """Instead of --iterations: real steps of every run."""
-    system: System = "me-trpo"
+    system: Annotated[System, arg(metavar="NAME")] = "me-trpo"
     """System, as metrpo train takes it."""
     preset: Preset = "fast"
     """What all other settings start from."""
@@ -335,13 +355,16 @@ class Tune:
     def __post_init__(self) -> None:
         if self.jobs is not None and self.jobs < 1:
             raise ConfigError(f"jobs: expected at least 1, got {self.jobs}")
-        if self.spec is not None:
-            apart = ("spec", "jobs", "out", "json", "dry_run")
-            given = [f.name for f in dataclasses.fields(self) if getattr(self, f.name) != f.default]
-            if twice := [name for name in given if name not in apart]:
-                raise ConfigError(
-                    f"{twice[0]}: expected it in {self.spec} alone; write it there, or leave the file out"
-                )
+        _require_file_alone(self, self.spec, apart=("spec", "jobs", "out", "json", "dry_run"))
+
+
+def _require_file_alone(command: Any, spec: Path | None, apart: tuple[str, ...]) -> None:
+    """Raises `ConfigError` when a file says what is run and options other than `apart` say so too."""
+    if spec is None:
+        return
+    fields = [f for f in dataclasses.fields(command) if f.name not in apart]
+    if twice := [f.name for f in fields if getattr(command, f.name) != f.default]:
+        raise ConfigError(f"{twice[0]}: expected it in {spec} alone; write it there, or leave the file out")
 
 
 @dataclass(frozen=True)
@@ -351,7 +374,7 @@ class Report:
     The page works without a network, on a phone too. Folders are searched for runs. For example:
         metrpo report runs/Swimmer-fast-seed0
         metrpo report runs/sweep --out sweep.html
-        metrpo report runs --json                         # the warnings and numbers, for scripts; writes the page too
+        metrpo report runs --json
     """
 
     dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
@@ -359,7 +382,7 @@ class Report:
     out: Annotated[Path, arg(metavar="FILE")] = Path("report.html")
     """File to write."""
     json: bool = False
-    """Print what the page says as JSON."""
+    """Print what the page says as JSON, besides writing it."""
 
     def __post_init__(self) -> None:
         _require_dirs(self.dirs)
@@ -372,7 +395,7 @@ class Plot:
     For example:
         metrpo plot runs/sweep
         metrpo plot runs/sweep --out sweep.pdf --x wall_seconds
-        metrpo plot runs --y gap --x iteration            # any column of metrics.csv or diagnostics.csv
+        metrpo plot runs --y gap --x iteration
     """
 
     dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
@@ -395,7 +418,7 @@ class Watch:
     Ctrl-C ends it; the runs go on. For example:
         metrpo watch runs
         metrpo watch runs/sweep runs/Swimmer-fast-seed0 --every 30
-        metrpo watch runs --once                          # the table once; --json for scripts
+        metrpo watch runs --once
     """
 
     dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR...")]
@@ -437,35 +460,53 @@ Command = (
     | Watch
 )
 
-_DESCRIPTION = """Model-Ensemble Trust-Region Policy Optimization: control learnt from few real steps.
+COMMANDS: dict[str, type] = {command.__name__.lower(): command for command in typing.get_args(Command)}
+"""Every command by its name."""
 
-Start with: metrpo train Swimmer. It ends by naming the learning curve and the video.
-"metrpo COMMAND --help" explains a command; "metrpo --version" prints the version."""
+_HELP = ("-h", "--help", "--help-all")
 
 
 def parse(arguments: list[str]) -> Command:
     """The command as typed; for `train` and `init`, with the task's preset as the defaults.
 
-    Raises `SystemExit` after printing help or what is wrong, `MetrpoError` for an impossible value or an unknown task.
+    Raises `SystemExit` after printing help, `MetrpoError` for what makes no sense, an impossible value or an unknown
+    task.
     """
+    if arguments[0] in _HELP:
+        print(overview())
+        raise SystemExit(0)
+    kind = COMMANDS[command_of(arguments, COMMANDS)]
+    arguments = joined(arguments, lists_of(kind))
+    asked = next((word for word in arguments if word in _HELP), None)
+    if issubclass(kind, Run):
+        return _parse_run(kind, [a for a in arguments if a not in _HELP], asked)
+    if asked is None:
+        return cast(Command, understood(lambda: _tyro(kind, None, arguments), kind, arguments))
+    _show(kind, None, arguments[0])
+
+
+def _parse_run(kind: type[Run], arguments: list[str], asked: str | None) -> Command:
     from metrpo.presets import preset
 
-    kind = {"train": Train, "init": Init}.get(arguments[0])
-    if kind is None:
-        return _with_defaults(Train(), arguments)
+    only = FEW if asked in ("-h", "--help") else None
     # Which defaults? That is among the arguments: they are read twice.
-    any_task, first = _defaults(kind, preset("Swimmer")), None
-    with contextlib.suppress(SystemExit):
-        first = cast(Run, _with_defaults(any_task, [a for a in arguments if a not in ("-h", "--help")], quiet=True))
-    if first is None:
-        return _with_defaults(any_task, arguments)
+    any_task = _defaults(kind, preset("Swimmer"))
+    try:
+        first = cast(Run, understood(lambda: _tyro(kind, any_task, arguments), kind, arguments))
+    except MetrpoError:
+        if asked is None:
+            raise
+        _show(kind, any_task, arguments[0], only)
     from metrpo.run import machine
 
     machine.prepare(first.device, first.deterministic)
     from metrpo.world.registry import get_task
 
     task = get_task(first.task).name
-    parsed = _with_defaults(_defaults(kind, preset(task, first.preset, first.system)), arguments)
+    defaults = _defaults(kind, preset(task, first.preset, first.system))
+    if asked is not None:
+        _show(kind, defaults, arguments[0], only)
+    parsed = understood(lambda: _tyro(kind, defaults, arguments), kind, arguments)
     return cast(Command, dataclasses.replace(cast(Run, parsed), task=task))
 
 
@@ -473,30 +514,15 @@ def _defaults(kind: type[Run], config: Config) -> Run:
     return kind(**{f.name: getattr(config, f.name) for f in dataclasses.fields(Config)} | {"task": tyro.MISSING})
 
 
-def _with_defaults(run: Run, arguments: list[str], quiet: bool = False) -> Command:
-    commands: Any = (
-        Annotated[Train, subcommand("train", default=run if isinstance(run, Train) else Train())]
-        | Annotated[Init, subcommand("init", default=run if isinstance(run, Init) else Init())]
-        | Annotated[Collect, subcommand("collect")]
-        | Annotated[Improve, subcommand("improve")]
-        | Annotated[Evaluate, subcommand("evaluate")]
-        | Annotated[Render, subcommand("render")]
-        | Annotated[Export, subcommand("export")]
-        | Annotated[Tasks, subcommand("tasks")]
-        | Annotated[Doctor, subcommand("doctor")]
-        | Annotated[Bench, subcommand("bench")]
-        | Annotated[Reproduce, subcommand("reproduce")]
-        | Annotated[Sweep, subcommand("sweep")]
-        | Annotated[Tune, subcommand("tune")]
-        | Annotated[Report, subcommand("report")]
-        | Annotated[Plot, subcommand("plot")]
-        | Annotated[Watch, subcommand("watch")]
-    )
-    return tyro.cli(
-        commands,
-        prog="metrpo",
-        description=_DESCRIPTION,
-        args=arguments,
-        console_outputs=not quiet,
-        config=(OmitSubcommandPrefixes, FlagCreatePairsOff),
-    )
+def _show(kind: type, default: Any, name: str, only: Collection[str] | None = None) -> NoReturn:
+    """Prints help and raises `SystemExit`."""
+    brief, default = shown(kind, default, only)
+    print(end="", flush=True)
+    _tyro(brief, default, [name, "--help"])
+    raise SystemExit(0)
+
+
+def _tyro(kind: type, default: Any, arguments: list[str]) -> object:
+    name, *rest = arguments
+    options = (OmitSubcommandPrefixes, FlagCreatePairsOff)
+    return tyro.cli(kind, prog=f"metrpo {name}", default=default, args=rest, config=options)

@@ -20,13 +20,13 @@ class Means:
     backend: Backend = "local"
     """local: processes of this machine, on cores of their own. ray: tasks of a Ray cluster (pip install
     'metrpo[ray]'); a run whose machine is lost goes on on another, from its last checkpoint."""
-    jobs: Annotated[int | None, arg(metavar="INT")] = None
+    jobs: Annotated[int | None, arg(metavar="INT", help_behavior_hint="")] = None
     """Runs at a time; default: as many as there are cores for."""
-    cpus: Annotated[int | None, arg(metavar="INT")] = None
+    cpus: Annotated[int | None, arg(metavar="INT", help_behavior_hint="")] = None
     """Cores for each run; default: local divides its cores among the jobs, ray gives 1."""
     gpus: float = 0.0
     """GPUs for each run, which ray assigns: 1, or a part such as 0.25 where runs share one."""
-    address: Annotated[str | None, arg(metavar="HOST:PORT")] = None
+    address: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="")] = None
     """The Ray cluster, to which this machine must belong; default: $RAY_ADDRESS, else the one that was started here,
     else a new one of this machine alone, which ends with the command."""
 

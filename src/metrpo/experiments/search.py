@@ -15,7 +15,7 @@ from metrpo.config import Config, Preset, System, flatten
 from metrpo.errors import ConfigError
 from metrpo.experiments.figures import Run
 from metrpo.experiments.space import Span, span, span_of
-from metrpo.experiments.sweep import flat, seeds_of, values_of
+from metrpo.experiments.sweep import flat, require_once, seeds_of, values_of
 from metrpo.presets import override, preset
 from metrpo.run.metrics import Row
 from metrpo.world.registry import get_task
@@ -146,16 +146,15 @@ def worth(returns: Sequence[Sequence[Row]], iterations: int | None = None) -> li
 def as_typed(command: Tune) -> Search:
     """The search of a command line. Raises `ConfigError` for what is none, or what `Search` raises."""
     searched, fixed = [span_of(text) for text in command.search], [values_of(text) for text in command.set]
-    for option, given in (("search", [name for name, _ in searched]), ("set", [name for name, _ in fixed])):
-        if len(set(given)) < len(given):
-            raise ConfigError(f"{option}: expected each setting once, got {', '.join(given)}")
+    require_once("search", [name for name, _ in searched])
+    require_once("set", [name for name, _ in fixed])
     if several := [name for name, values in fixed if len(values) != 1]:
         raise ConfigError(f"set: {several[0]}: expected one value, got several; --search chooses among them")
     names = [f.name for f in dataclasses.fields(Search) if f.name not in ("space", "settings", "seeds")]
     return Search(
         **cast(Any, {name: getattr(command, name) for name in names}),
         space=dict(searched),
-        seeds=seeds_of(command.seeds),
+        seeds=seeds_of(",".join(command.seeds)),
         settings={name: values[0] for name, values in fixed},
     )
 

@@ -9,12 +9,15 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import TYPE_CHECKING, Any, cast, get_args
 
-from metrpo.config import Preset, System
+from metrpo.config import BUDGET_FIELDS, Preset, System
 from metrpo.errors import ConfigError
 from metrpo.experiments.figures import Run
 from metrpo.world.registry import get_task
+
+if TYPE_CHECKING:
+    from metrpo.options import Sweep
 
 _LONGEST, _KEPT = 255, 180
 """Bytes that a folder's name may have on common disks, and how many of a longer one stay readable."""
@@ -30,6 +33,9 @@ class Grid:
     preset: Preset = "fast"
     settings: Mapping[str, Sequence[Any]] = field(default_factory=dict)
     """Dotted setting -> its values."""
+    iterations: int | None = None
+    real_steps: int | None = None
+    """The budget of every run, one of the two; default: the preset's. It names no folder, for it may be raised."""
 
     def runs(self) -> list[Run]:
         """Every run of the grid, first seeds first.
@@ -40,6 +46,11 @@ class Grid:
         names, columns = list(self.settings), [list(values) for values in self.settings.values()]
         if not self.tasks or not self.systems or not self.seeds or not all(columns):
             raise ConfigError("sweep: expected at least one task, system, seed and value of each setting, got none")
+        budget = tuple((n, v) for n in BUDGET_FIELDS if (v := getattr(self, n)) is not None)
+        if len(budget) > 1:
+            raise ConfigError("sweep: expected iterations or real_steps, got both; leave one out")
+        if twice := [name for name in names if budget and name in BUDGET_FIELDS]:
+            raise ConfigError(f"set: expected each budget once, got {twice[0]} besides {budget[0][0]}; leave one out")
         if unknown := [s for s in self.systems if s not in get_args(System)]:
             raise ConfigError(f"sweep: systems: expected some of {', '.join(get_args(System))}, got {unknown[0]}")
         found = []
@@ -48,14 +59,15 @@ class Grid:
             self.seeds, tasks, self.systems, itertools.product(*columns)
         ):
             overrides = tuple((name, _hashable(value)) for name, value in zip(names, values, strict=True))
-            found.append(Run(task, system, seed, overrides, self.preset, _variant(system, overrides)))
+            variant = _variant(system, overrides)
+            found.append(Run(task, system, seed, budget + overrides, self.preset, variant))
         for run in found:
             _ = run.config
         return list(dict.fromkeys(found))
 
 
 def from_file(path: Path) -> Grid:
-    """The grid in a TOML file: tasks, systems, seeds (a list or "0:5"), preset, and a table [set] of settings.
+    """The grid in a TOML file: tasks, systems, seeds (a list or "0:5"), preset, budget, and a table [set] of settings.
 
     Raises `ConfigError` when it cannot be read or says something else.
     """
@@ -64,27 +76,51 @@ def from_file(path: Path) -> Grid:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"{path}: expected a TOML file with tasks, seeds and [set], got {error}") from error
     settings = spec.pop("set", {})
-    if unknown := [key for key in spec if key not in ("tasks", "systems", "seeds", "preset")]:
-        raise ConfigError(f"{path}: expected tasks, systems, seeds, preset and [set], got {unknown[0]}")
+    plain = ("preset", *BUDGET_FIELDS)
+    if unknown := [key for key in spec if key not in ("tasks", "systems", "seeds", *plain)]:
+        raise ConfigError(f"{path}: expected tasks, systems, seeds, {', '.join(plain)} and [set], got {unknown[0]}")
     if isinstance(spec.get("seeds"), str):
         spec["seeds"] = seeds_of(spec["seeds"])
     if not isinstance(settings, dict) or not all(isinstance(spec.get(k, []), list | tuple) for k in ("tasks", "seeds")):
         raise ConfigError(f"{path}: expected lists of tasks and seeds, and a table [set]")
-    lists = {key: value if key == "preset" else tuple(value) for key, value in spec.items()}
+    lists = {key: value if key in plain else tuple(value) for key, value in spec.items()}
     columns = {name: value if isinstance(value, list) else [value] for name, value in flat(settings).items()}
     return Grid(**cast(Any, {"tasks": (), **lists, "settings": columns}))
 
 
+def as_typed(command: Sweep) -> Grid:
+    """The grid of a command line. Raises `ConfigError` for what is none."""
+    settings = [values_of(text) for text in command.set]
+    require_once("set", [name for name, _ in settings])
+    return Grid(
+        command.tasks,
+        command.systems,
+        seeds_of(",".join(command.seeds)),
+        command.preset,
+        dict(settings),
+        command.iterations,
+        command.real_steps,
+    )
+
+
+def require_once(option: str, names: Sequence[str]) -> None:
+    """Raises `ConfigError` when an option is to set something twice."""
+    if len(set(names)) < len(names):
+        raise ConfigError(f"{option}: expected each setting once, got {', '.join(names)}")
+
+
 def seeds_of(text: str) -> tuple[int, ...]:
-    """Seeds as typed: "3" is 3, "0:5" is 0 to 4, "0,2,7" these. Raises `ConfigError` for anything else."""
-    try:
-        first, colon, end = text.partition(":")
-        found = tuple(range(int(first or 0), int(end))) if colon else tuple(int(n) for n in text.split(","))
-    except ValueError:
-        found = ()
+    """Seeds as typed: "3" is 3, "0:5" is 0 to 4, "0,2,7" these, each once. Raises `ConfigError` for anything else."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, colon, end = part.partition(":")
+        try:
+            found += range(int(first or 0), int(end)) if colon else [int(part)]
+        except ValueError:
+            found.append(-1)
     if not found or min(found) < 0:
         raise ConfigError(f"seeds: expected a number, a range such as 0:5 or a list such as 0,2,7, got {text!r}")
-    return found
+    return tuple(dict.fromkeys(found))
 
 
 def values_of(text: str) -> tuple[str, list[Any]]:

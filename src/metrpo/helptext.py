@@ -1,0 +1,93 @@
+"""What help shows: a list of commands that fits a screen, and of a run's many settings the few that people use."""
+
+from __future__ import annotations
+
+import dataclasses
+import typing
+from collections.abc import Collection
+from typing import Annotated, Any
+
+import tyro
+from tyro.conf import arg
+
+GROUPS: dict[str, dict[str, str]] = {
+    "Learn": {
+        "train": "Learn a task, or go on with a run",
+        "tasks": "List the tasks that can be learnt",
+    },
+    "Look": {
+        "watch": "Show where many runs stand, live",
+        "report": "Write one HTML page: curves, warnings, videos",
+        "plot": "Draw learning curves",
+    },
+    "Use": {
+        "evaluate": "Play real episodes and say what they earn",
+        "render": "Record an episode as a video",
+        "export": "Write the policy as one file without metrpo",
+    },
+    "Many runs": {
+        "sweep": "Run a grid of tasks, seeds and settings",
+        "tune": "Search over settings",
+        "reproduce": "Run and draw a figure of the paper",
+    },
+    "Your robot": {
+        "init": "Start a run whose episodes another program plays",
+        "collect": "Add real episodes to a run",
+        "improve": "Learn from the episodes that wait, once",
+    },
+    "This machine": {
+        "doctor": "Check versions, devices, OpenGL, video encoder",
+        "bench": "Measure this machine and our work on it",
+    },
+}
+"""Purpose -> command -> what it does, in a few words."""
+
+FEW = frozenset(
+    {
+        "task",
+        "preset",
+        "seed",
+        "iterations",
+        "real_steps",
+        "system",
+        "data",
+        "learn_reward",
+        "evaluation_episodes",
+        "run_dir",
+        "device",
+        "video",
+    }
+)
+"""The options of a run that `--help` shows; `--help-all` shows all."""
+
+
+def overview() -> str:
+    """All commands, within 24 lines of 80 columns."""
+    lines = ["usage: metrpo COMMAND [OPTIONS]     control learnt from few real steps (ME-TRPO)", ""]
+    for purpose, commands in GROUPS.items():
+        for i, (name, text) in enumerate(commands.items()):
+            lines.append(f"{purpose if i == 0 else '':<14}{name:<11}{text}")
+    lines += ["", 'Start with: metrpo train Swimmer. "metrpo COMMAND --help" explains a command;']
+    return "\n".join([*lines, '"metrpo train --help-all" lists every setting; "metrpo --version" is there too.'])
+
+
+def shown(kind: Any, default: Any, only: Collection[str] | None = None) -> tuple[Any, Any]:
+    """The class of a command as help is to show it, and `default` (None: the class's own values) as one of it.
+
+    Options beyond `only` (None: all) are left out. No default is told where it says nothing: of a switch, or None.
+    """
+    hints = typing.get_type_hints(kind, include_extras=True)
+    changed = []
+    for field in dataclasses.fields(kind):
+        value = getattr(default or kind, field.name, dataclasses.MISSING)
+        hint: Any = hints[field.name]
+        if only is not None and field.name not in only:
+            hint = Annotated[hint, tyro.conf.Suppress]
+        elif value is None or isinstance(value, bool) or value == ():
+            hint = Annotated[hint, arg(help_behavior_hint="")]
+        else:
+            continue
+        changed.append((field.name, hint, field))
+    brief: Any = dataclasses.make_dataclass(kind.__name__, changed, bases=(kind,), frozen=True)
+    brief.__doc__ = kind.__doc__
+    return brief, default and brief(**{f.name: getattr(default, f.name) for f in dataclasses.fields(kind)})

@@ -1,0 +1,159 @@
+"""The words of a command line: lists that may be given in several ways, and what is said when they make no sense."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import difflib
+import io
+import os
+import re
+import typing
+from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import Annotated, TypeVar
+
+import tyro
+
+from metrpo.errors import ConfigError
+
+T = TypeVar("T")
+_KINDS = {"INT": "a whole number", "FLOAT": "a number"}
+
+
+def joined(arguments: Sequence[str], lists: Collection[str]) -> list[str]:
+    """The arguments with every option among `lists` once: `--set a --set b`, `--set=a --set b` become `--set a b`."""
+    found: list[str | list[str]] = []
+    given: dict[str, list[str]] = {}
+    open_list: list[str] | None = None
+    for word in arguments:
+        option, equals, value = word.partition("=")
+        option = option.replace("_", "-")
+        if word.startswith("-"):
+            open_list = None
+        if option in lists:
+            if option not in given:
+                given[option] = [option]
+                found.append(given[option])
+            given[option] += [value] if equals else []
+            open_list = None if equals else given[option]
+        elif open_list is not None:
+            open_list.append(word)
+        else:
+            found.append(word)
+    return [word for part in found for word in (part if isinstance(part, list) else [part])]
+
+
+def lists_of(kind: type) -> set[str]:
+    """The options of a command that take several values."""
+    fields = [f for f in dataclasses.fields(kind) if isinstance(f.default, tuple)]
+    return {f"--{f.name.replace('_', '-')}" for f in fields}
+
+
+def command_of(arguments: Sequence[str], commands: Collection[str]) -> str:
+    """The command that is typed. Raises `ConfigError` for one that is unknown, with the one that may be meant."""
+    word = arguments[0]
+    if word in commands:
+        return word
+    if word.startswith("-"):
+        raise ConfigError(f"expected a command before {word}, such as train; metrpo --help lists them")
+    near = difflib.get_close_matches(word, commands, 1)
+    raise ConfigError(f"unknown command {word!r}{_meant(near)} metrpo --help lists them")
+
+
+def understood(parse: Callable[[], T], kind: type, arguments: Sequence[str]) -> T:
+    """What `parse` returns; where it prints what is wrong and ends with 2, that is said in one line instead.
+
+    `kind` is the command's class, `arguments` are its words. Raises `ConfigError`.
+    """
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(printed), _wide():
+            return parse()
+    except SystemExit as end:
+        if not end.code:
+            raise
+    raise ConfigError(f"{arguments[0]}: {_complaint(printed.getvalue(), kind, arguments)}") from None
+
+
+def _complaint(text: str, kind: type, arguments: Sequence[str]) -> str:
+    """The parser's own words, a title and paragraphs between rules, in short."""
+    bare = (line.strip("│|╭╮╰╯─+- ") for line in text.splitlines())
+    title, *lines = [line for line in bare if line] or ["Nothing"]
+    see = f"see metrpo {arguments[0]} --help"
+    if title.startswith("Unrecognized"):
+        return _unknown(kind, arguments)
+    if title.startswith("Required") and len(lines) > 2:
+        return f"expected {lines[1].split()[0]}: {lines[2].removesuffix(' (required)')}"
+    said = lines[0] if lines else title
+    if wrong := re.match(r"Error parsing (--[\w.-]+)", said):
+        usage = re.search(rf"^\W*{re.escape(wrong[1])} (.+?)\s*$", text, re.MULTILINE)
+        expected = _KINDS.get(usage[1], usage[1]) if usage else "something else"
+        return f"{wrong[1]}: expected {expected}, got {_given(wrong[1], arguments)}"
+    if wrong := re.match(r"invalid choice '(.*)' for argument '(.*)'. Expected one of \((.*)\)", said):
+        choices = [choice for part in wrong[3].split(",") if (choice := part.strip("' "))]
+        near = difflib.get_close_matches(wrong[1], choices, 1)
+        return f"{wrong[2]}: expected one of {', '.join(choices)}, got {wrong[1]}{_meant(near).rstrip(';')}"
+    if wrong := re.match(r"Missing value for argument '(.*)'", said):
+        return f"{wrong[1]}: expected a value, got none; {see}"
+    return f"{said.rstrip('!.')}; {see}"
+
+
+def _given(option: str, arguments: Sequence[str]) -> str:
+    """The last words that are given for `option`."""
+    values: list[str] = []
+    at = None
+    for word in arguments:
+        name, equals, value = word.partition("=")
+        if word.startswith("--"):
+            at = name.replace("_", "-")
+            values = ([value] if equals else []) if at == option else values
+        elif at == option:
+            values.append(word)
+    return " ".join(values) or "nothing"
+
+
+def options_of(kind: type, prefix: str = "") -> list[str]:
+    """Every option of a command's class, as it is typed."""
+    hints, found = typing.get_type_hints(kind, include_extras=True), list[str]()
+    for field in dataclasses.fields(kind):
+        hint, marks = hints[field.name], getattr(hints[field.name], "__metadata__", ())
+        base = hint.__origin__ if typing.get_origin(hint) is Annotated else hint
+        if tyro.conf.Positional in marks:
+            continue
+        name = prefix + field.name.replace("_", "-")
+        if isinstance(base, type) and dataclasses.is_dataclass(base):
+            found += options_of(base, prefix if tyro.conf.OmitArgPrefixes in marks else f"{name}.")
+        else:
+            found.append(f"--no-{name}" if field.default is True else f"--{name}")
+    return found
+
+
+def _unknown(kind: type, arguments: Sequence[str]) -> str:
+    command, options = arguments[0], options_of(kind)
+    for word in arguments[1:]:
+        option = word.partition("=")[0].replace("_", "-")
+        if not option.startswith("-") or option in options or re.match(r"-[\d.]", option):
+            continue
+        short = [o for o in options if o.rpartition(".")[2] == option.lstrip("-")]
+        near = short[:1] or difflib.get_close_matches(option, options, 1)
+        more = "--help-all" if command in ("train", "init") else "--help"
+        return f"unknown option {word.partition('=')[0]}{_meant(near)} metrpo {command} {more} lists all"
+    return f"expected fewer words that belong to no option; see metrpo {command} --help"
+
+
+def _meant(near: Sequence[str]) -> str:
+    return f", did you mean {near[0]}?" if near else ";"
+
+
+@contextlib.contextmanager
+def _wide() -> Iterator[None]:
+    """Nothing that is printed in this block is wrapped."""
+    before = os.environ.get("COLUMNS")
+    os.environ["COLUMNS"] = "1000"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["COLUMNS"]
+        else:
+            os.environ["COLUMNS"] = before
