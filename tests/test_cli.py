@@ -344,22 +344,22 @@ def test_the_environment_is_ready_before_jax(monkeypatch, tmp_path):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(machine, "_may_have_gpu", lambda: False)
-    machine.prepare(None, deterministic=False)
+    machine.set_variables(None, deterministic=False)
     assert os.environ["JAX_PLATFORMS"] == "cpu"
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == str(tmp_path / "metrpo" / "jax")
     cores = len(os.sched_getaffinity(0))
     patient = " ".join(machine.PATIENT)
     assert os.environ["XLA_FLAGS"] == f"--xla_force_host_platform_device_count={min(cores, 8)} {patient}"
-    machine.prepare(None, deterministic=False)
+    machine.set_variables(None, deterministic=False)
     assert [os.environ["XLA_FLAGS"].count(f) for f in ("device_count", "terminate_timeout")] == [1, 1]
     monkeypatch.setenv("XLA_FLAGS", "--xla_mine=1")
     monkeypatch.setenv("JAX_PLATFORMS", "tpu")
-    machine.prepare(None, deterministic=True)
+    machine.set_variables(None, deterministic=True)
     flags = "--xla_mine=1 --xla_force_host_platform_device_count=1 --xla_cpu_multi_thread_eigen=false"
     flags += f" {patient}"
     assert os.environ["XLA_FLAGS"] == flags
     assert (os.environ["JAX_PLATFORMS"], os.environ["NPROC"]) == ("tpu", "1")
-    machine.prepare("cpu", deterministic=False)
+    machine.set_variables("cpu", deterministic=False)
     assert os.environ["JAX_PLATFORMS"] == "cpu"
 
 
@@ -396,13 +396,58 @@ def test_deterministic_leaves_xla_one_thread():
     assert (ran.stdout, ran.stderr) == ("1\n", "")
 
 
-def test_no_gpu_is_one_message(capsys, monkeypatch):
-    def none() -> None:
-        raise RuntimeError("no cuda")
+NO_GPU = pytest.mark.skipif(machine.has_nvidia() or Path("/dev/kfd").exists(), reason="there may be a GPU")
 
-    monkeypatch.setattr("jax.devices", none)
-    assert run("train", "Swimmer", "--device", "gpu") == 2
-    assert "device: expected a GPU that JAX can use, got none (no cuda)" in capsys.readouterr().err
+
+def program(*arguments: str, **environment: str | None) -> subprocess.CompletedProcess[str]:
+    """The command as a process of its own, with these environment variables (None: unset)."""
+    merged = {name: value for name, value in (os.environ | environment).items() if value is not None}
+    command = [sys.executable, "-m", "metrpo", *arguments]
+    return subprocess.run(command, env=merged, capture_output=True, text=True, encoding="utf-8", errors="replace")
+
+
+@NO_GPU
+@pytest.mark.parametrize("platforms", [None, "cpu"])
+def test_a_gpu_that_is_not_there_is_one_message(platforms):
+    ran = program("train", "Swimmer", "--device", "gpu", "--run-dir", "a", JAX_PLATFORMS=platforms)
+    assert ran.returncode == 2
+    assert "metrpo: device: expected a GPU that JAX can use, got " in ran.stderr
+    assert "cpu: cpu; install JAX for it (pip install 'jax[cuda13]', or 'jax[cuda12]'" in ran.stderr
+    assert ran.stderr.count("\n") == 1
+    assert not Path("a").exists()
+
+
+@NO_GPU
+@pytest.mark.parametrize("platforms", ["cuda", "nonsense"])
+def test_a_platform_that_jax_cannot_use_is_one_message(platforms):
+    ran = program("train", "Swimmer", "--run-dir", "a", JAX_PLATFORMS=platforms)
+    assert ran.returncode == 2
+    assert f"metrpo: JAX_PLATFORMS={platforms}: JAX cannot use it (" in ran.stderr
+    assert ran.stderr.count("\n") == 1
+
+
+def test_doctor_names_a_platform_that_jax_cannot_use(capsys, monkeypatch):
+    def unusable() -> list[str]:
+        raise metrpo.MetrpoError("JAX_PLATFORMS=tpu: JAX cannot use it (none)")
+
+    monkeypatch.setattr(doctor, "device_names", unusable)
+    monkeypatch.setenv("JAX_PLATFORMS", "tpu")
+    assert run("doctor") == 1
+    assert "problem: JAX_PLATFORMS=tpu: JAX cannot use it (none): unset JAX_PLATFORMS" in capsys.readouterr().out
+
+
+def test_the_cpu_that_is_asked_for_wins_over_the_users_variable():
+    code = "from metrpo.run import machine; machine.prepare('cpu', True); print(machine.device_names())"
+    ran = subprocess.run(
+        [sys.executable, "-c", code], env=os.environ | {"JAX_PLATFORMS": "cuda"}, capture_output=True, text=True
+    )
+    assert ran.stdout == "['cpu: cpu']\n", ran.stderr
+
+
+def test_any_cuda_plugin_is_a_gpu_that_may_be_there(monkeypatch):
+    monkeypatch.setattr(machine, "has_nvidia", lambda: True)
+    monkeypatch.setattr(machine, "find_spec", lambda name: name if name == "jax_cuda13_plugin" else None)
+    assert machine._may_have_gpu()
 
 
 STOPPED = """

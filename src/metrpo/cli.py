@@ -239,7 +239,7 @@ def _tasks(command: Tasks) -> int:
 def _doctor(command: Doctor) -> int:
     from metrpo.run import machine
 
-    machine.prepare(None, deterministic=False)
+    machine.set_variables(None, deterministic=False)  # what is wrong with them is what it looks for
     from metrpo.run.doctor import diagnose
 
     found = diagnose()

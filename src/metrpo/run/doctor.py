@@ -7,6 +7,7 @@ import platform
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 
+from metrpo.errors import MetrpoError
 from metrpo.run import video
 from metrpo.run.files import metrpo_version
 from metrpo.run.machine import INSTALL_GPU, cores, device_names, has_nvidia
@@ -61,8 +62,8 @@ def diagnose() -> Diagnosis:
 def _look_for_devices(found: Diagnosis) -> None:
     try:
         found.devices = device_names()
-    except RuntimeError as error:
-        found.problems.append(f"JAX finds no device ({error}): unset JAX_PLATFORMS or use --device cpu")
+    except MetrpoError as error:
+        found.problems.append(f"{error}: unset JAX_PLATFORMS or use --device cpu")
     if has_nvidia() and not any(device.startswith("gpu") for device in found.devices):
         found.hints.append(f"there is an NVIDIA GPU, but JAX does not use it: {INSTALL_GPU}")
 

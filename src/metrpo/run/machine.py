@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import tempfile
 from collections import Counter
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,7 +22,8 @@ PATIENT = (
 """A device of a CPU may wait for another as long as it takes. By itself XLA aborts the process after a minute, which
 large batches, an overloaded machine or a process stopped for a while (Ctrl-Z) can take."""
 
-INSTALL_GPU = "pip install 'metrpo[gpu]' (NVIDIA, CUDA 12)"
+INSTALL_GPU = "pip install 'jax[cuda13]', or 'jax[cuda12]' for older NVIDIA drivers"
+_CUDA_PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 
 
 def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
@@ -32,10 +34,18 @@ def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
     is kept between processes in $JAX_COMPILATION_CACHE_DIR (default: metrpo/jax in the user's cache directory). Where
     there may be a GPU, float32 products are taken in float32 ($JAX_DEFAULT_MATMUL_PRECISION says otherwise).
 
-    Raises `MetrpoError` when `device` is "gpu" and JAX finds none.
+    Raises `MetrpoError` when `device` is "gpu" and JAX finds none, and when JAX cannot use what the user's
+    JAX_PLATFORMS names.
     """
+    set_variables(device, deterministic)
+    if device == "gpu" or os.environ.get("JAX_PLATFORMS", "cpu") not in ("", "cpu"):
+        _require_device(device)
+
+
+def set_variables(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
+    """What `prepare` sets, without a look at the devices, which imports JAX."""
     if device is not None:
-        os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": "cuda,cpu"}[device]
+        os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": f"{_gpu_platform()},cpu"}[device]
     elif not _may_have_gpu():
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
     if deterministic:
@@ -53,8 +63,6 @@ def prepare(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> None:
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "jax"))
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-    if device == "gpu":
-        _require_gpu()
 
 
 def _add_flags(*flags: str) -> None:
@@ -62,15 +70,30 @@ def _add_flags(*flags: str) -> None:
 
 
 def cache_folder() -> Path:
-    """Where metrpo keeps what can be made again: metrpo in the user's cache directory."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "metrpo"
+    """Where metrpo keeps what can be made again: metrpo in the user's cache directory.
+
+    A user without a home (in a container, under a number that no passwd entry names) has one in the temporary directory.
+    """
+    if named := os.environ.get("XDG_CACHE_HOME"):
+        return Path(named) / "metrpo"
+    try:
+        return Path.home() / ".cache" / "metrpo"
+    except RuntimeError:
+        return Path(tempfile.gettempdir()) / f"metrpo-cache-{os.getuid()}"
 
 
 def device_names() -> list[str]:
-    """JAX's devices, equal ones counted: ["2 x cpu: cpu"]. Raises JAX's `RuntimeError` where there is none."""
+    """JAX's devices, equal ones counted: ["2 x cpu: cpu"]. Raises `MetrpoError` where JAX can use none."""
     import jax
 
-    names = Counter(f"{device.platform}: {device.device_kind}" for device in jax.devices())
+    try:
+        devices = jax.devices()
+    except Exception as error:  # JAX asserts where its build lacks a platform that it knows
+        reason = str(error).split("\n")[0] or f"{type(error).__name__} in JAX"
+        raise MetrpoError(
+            f"JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}: JAX cannot use it ({reason})"
+        ) from error
+    names = Counter(f"{device.platform}: {device.device_kind}" for device in devices)
     return [name if count == 1 else f"{count} x {name}" for name, count in names.items()]
 
 
@@ -79,25 +102,33 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _require_gpu() -> None:
+def _require_device(device: Literal["cpu", "gpu"] | None) -> None:
+    """Raises `MetrpoError` unless JAX finds what was asked for: by itself it takes the CPU in silence."""
+    try:
+        found = device_names()
+    except MetrpoError as error:
+        raise MetrpoError(f"{error}; unset JAX_PLATFORMS, or install the GPU's JAX: {INSTALL_GPU}") from None
     import jax
 
-    try:
-        jax.devices()
-    except RuntimeError as error:
+    if device == "gpu" and jax.devices()[0].platform != "gpu":
         raise MetrpoError(
-            f"device: expected a GPU that JAX can use, got none ({error}); {INSTALL_GPU}, or use --device cpu"
-        ) from None
+            f"device: expected a GPU that JAX can use, got {', '.join(found)}; install JAX for it "
+            f"({INSTALL_GPU}), or use --device cpu"
+        )
+
+
+def _gpu_platform() -> str:
+    return "rocm" if Path("/dev/kfd").exists() and not has_nvidia() else "cuda"
 
 
 def _may_have_gpu() -> bool:
     return (
         sys.platform != "linux"
-        or (has_nvidia() and any(find_spec(f"jax_cuda{cuda}_plugin") is not None for cuda in (12, 13)))
+        or (has_nvidia() and any(find_spec(plugin) is not None for plugin in _CUDA_PLUGINS))
         or Path("/dev/kfd").exists()
     )
 
 
 def has_nvidia() -> bool:
-    """Whether this machine has an NVIDIA GPU with its driver."""
-    return Path("/dev/nvidiactl").exists()
+    """Whether this machine has an NVIDIA GPU with its driver; under WSL 2 it is /dev/dxg."""
+    return Path("/dev/nvidiactl").exists() or Path("/dev/dxg").exists()
