@@ -42,6 +42,8 @@ from metrpo.options import (
     parse,
 )
 from metrpo.run.interrupt import Interruptible, Stopped, stop
+from metrpo.run.machine import settle_libraries
+from metrpo.run.printing import print_anywhere
 from metrpo.run.progress import Progress, mute_broken_output
 
 _log = logging.getLogger("metrpo")
@@ -51,6 +53,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns the exit code: 0, 2 after a wrong input, 130 after Ctrl-C, 143 after SIGTERM."""
     arguments = list(sys.argv[1:] if argv is None else argv) or ["--help"]
     _occupy_standard_files()
+    print_anywhere()
+    settle_libraries()
     logging.basicConfig(format="metrpo: %(message)s", level=logging.WARNING)
     if arguments == ["--version"]:
         return _version()

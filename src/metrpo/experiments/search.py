@@ -166,7 +166,7 @@ def from_file(path: Path) -> Search:
     """
     names = [f.name for f in dataclasses.fields(Search) if f.name not in ("space", "settings")]
     try:
-        spec = tomllib.loads(path.read_text())
+        spec = tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"{path}: expected a TOML file with task and [search], got {error}") from error
     searched, settings = spec.pop("search", {}), spec.pop("set", {})

@@ -72,7 +72,7 @@ def from_file(path: Path) -> Grid:
     Raises `ConfigError` when it cannot be read or says something else.
     """
     try:
-        spec = tomllib.loads(path.read_text())
+        spec = tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"{path}: expected a TOML file with tasks, seeds and [set], got {error}") from error
     settings = spec.pop("set", {})

@@ -6,6 +6,7 @@ import os
 import sys
 import tempfile
 from collections import Counter
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
@@ -72,14 +73,26 @@ def _add_flags(*flags: str) -> None:
 def cache_folder() -> Path:
     """Where metrpo keeps what can be made again: metrpo in the user's cache directory.
 
-    A user without a home (in a container, under a number that no passwd entry names) has one in the temporary directory.
+    A user without a home to write to has one in the temporary directory: in a container, say, under a number that
+    passwd does not name.
     """
     if named := os.environ.get("XDG_CACHE_HOME"):
         return Path(named) / "metrpo"
-    try:
-        return Path.home() / ".cache" / "metrpo"
-    except RuntimeError:
-        return Path(tempfile.gettempdir()) / f"metrpo-cache-{os.getuid()}"
+    with suppress(RuntimeError):  # no home at all
+        if _may_write(folder := Path.home() / ".cache"):
+            return folder / "metrpo"
+    return Path(tempfile.gettempdir()) / f"metrpo-cache-{os.getuid()}"
+
+
+def settle_libraries() -> None:
+    """Lets Matplotlib keep its fonts where metrpo keeps its cache, if the user has no home to write to."""
+    if cache_folder().name != "metrpo":
+        os.environ.setdefault("MPLCONFIGDIR", str(cache_folder() / "matplotlib"))
+
+
+def _may_write(folder: Path) -> bool:
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    return os.access(there, os.W_OK)
 
 
 def device_names() -> list[str]:
