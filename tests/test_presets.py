@@ -98,6 +98,8 @@ OURS = {
     "advantage.value_steps": (40, "of the network that the paper does not have"),
     "advantage.value_batch_size": (1000, "of the network that the paper does not have"),
     "advantage.value_learning_rate": (1e-3, "of the network that the paper does not have"),
+    "policy.normalise": (False, "code: the policy sees the full, unnormalised state"),
+    "policy.mean_penalty": (0.0, "the paper knows none: off"),
     "imagine.disagreement": (0.0, "the paper's future work: off"),
     "trust_reward": (False, "the paper's tasks are our own"),
     "learn_reward": (False, "section 2: the reward function is known"),

@@ -150,16 +150,13 @@ class PolicyConfig:
     """Standard deviation at the start of every policy phase."""
     normalise: bool = False
     """Let the policy see states normalised by the dataset, and not the dimensions that the models do not see."""
-    keep_std: bool = False
-    """Go on with the accepted policy's standard deviation in the next phase, instead of starting from initial_std."""
-    min_std: float = 0.1
-    """Least standard deviation at the start of a phase."""
     mean_penalty: float = 0.0
-    """TRPO: taken from the surrogate, this times the squared excess of mean actions beyond [-1, 1]."""
+    """Taken from the surrogate of trpo, ppo and vpg: this times the squared excess of mean actions beyond [-1, 1]."""
 
     def __post_init__(self) -> None:
         _require(all(n >= 1 for n in self.hidden), "policy.hidden", self.hidden, "sizes of at least 1")
         _require(_positive(self.initial_std), "policy.initial_std", self.initial_std, "a finite number > 0")
+        _require(_nonnegative(self.mean_penalty), "policy.mean_penalty", self.mean_penalty, "a finite number >= 0")
 
 
 @dataclass(frozen=True)
@@ -389,8 +386,6 @@ BUDGET_FIELDS = ("iterations", "real_steps")
 ADDED = (
     "config.fit.products",
     "config.policy.normalise",
-    "config.policy.keep_std",
-    "config.policy.min_std",
     "config.policy.mean_penalty",
     "config.imagine.horizon",
     "config.imagine.products",

@@ -56,6 +56,8 @@ SYSTEMS: dict[str, Overrides] = {
         "collect.steps": 50_000,
         "trpo.max_kl": 0.05,
         "policy.initial_std": 1.0,
+        "advantage.baseline": "linear",
+        "advantage.gae_lambda": 1.0,
     },
     "ppo": {"method": "ppo", "iterations": 50, "collect.steps": 20_480, "policy.initial_std": 1.0},
     "ddpg": {"method": "ddpg", "iterations": 60, "collect.steps": 5_000},

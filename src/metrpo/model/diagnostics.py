@@ -38,6 +38,8 @@ class Diagnosis(NamedTuple):
     """The same along imagined episodes of the policy: far above the real one, it has gone where the models guess."""
     outside: float
     """Share of these imagined states that leave the range of the training data in any dimension."""
+    saturated: float
+    """Share of the policy's mean actions there that lie beyond [-1, 1], to which they are clipped."""
 
     def row(self) -> dict[str, float]:
         """As columns: `error_K` (median over the dimensions), `error_K_D` for each dimension, and the rest.
@@ -66,7 +68,7 @@ def diagnose(
     starts = np.asarray(held_out.states)[rows]
     # From the host: where arrays lie is no reason to compile anew.
     on_host = jax.device_get((ensemble, policy))
-    predicted, spread, imagined, guessed = jax.device_get(_rollouts(*on_host, starts, actions, key))
+    predicted, spread, imagined, guessed, beyond = jax.device_get(_rollouts(*on_host, starts, actions, key))
     after = np.asarray(held_out.states) + np.asarray(held_out.deltas)[:, :size]
     errors = {}
     for k in [k for k in HORIZONS if k < length] + [length]:
@@ -75,7 +77,7 @@ def diagnose(
         errors[k] = _relative(predicted[k - 1][:, there], starts[there], ends)
     low, high = train.states.min(0), train.states.max(0)
     outside = ~np.all((imagined >= low) & (imagined <= high), axis=-1)  # also where it is no number
-    return Diagnosis(errors, float(spread.mean()), float(guessed.mean()), float(outside.mean()))
+    return Diagnosis(errors, float(spread.mean()), float(guessed.mean()), float(outside.mean()), float(beyond.mean()))
 
 
 def _starts(t: Transitions, length: int) -> tuple[np.ndarray, np.ndarray]:
@@ -114,9 +116,9 @@ def _median(values: Sequence[float] | np.ndarray) -> float:
 @jax.jit
 def _rollouts(
     ensemble: Ensemble, policy: Policy, starts: Array, actions: Array, key: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Every member's open-loop predictions [L, K, N, S], the spread on the starts [N], and imagined states [L, N, S]
-    of the policy with the members' spread along them [L, N]."""
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Every member's open-loop predictions [L, K, N, S], the spread on the starts [N]; and of the policy's imagined
+    episodes the states [L, N, S], the members' spread along them [L, N] and which mean actions saturate [L, N, A]."""
     size = starts.shape[-1]
     members = ensemble.members
 
@@ -124,14 +126,15 @@ def _rollouts(
         following = predict(ensemble, states, jnp.broadcast_to(action, (members, *action.shape)))[..., :size]
         return following, following
 
-    def imagined(states: Array, key: Array) -> tuple[Array, tuple[Array, Array]]:
-        mean = jnp.clip(gaussian.mean(policy, states), -1.0, 1.0)
+    def imagined(states: Array, key: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+        drawn = gaussian.mean(policy, states)
+        mean = jnp.clip(drawn, -1.0, 1.0)
         spread = disagreement(ensemble, states, mean)
         following = step_rand(ensemble, states, mean, Keys(key, key))[..., :size]
-        return jnp.clip(following, -EXPLODED, EXPLODED), (following, spread)
+        return jnp.clip(following, -EXPLODED, EXPLODED), (following, spread, jnp.abs(drawn) > 1)
 
     length = actions.shape[1]
     copies = jnp.broadcast_to(starts, (members, *starts.shape))
     _, predicted = jax.lax.scan(open_loop, copies, jnp.swapaxes(jnp.asarray(actions), 0, 1))
-    _, (dreamt, spread) = jax.lax.scan(imagined, jnp.asarray(starts), jax.random.split(key, length))
-    return predicted, disagreement(ensemble, jnp.asarray(starts), jnp.asarray(actions)[:, 0]), dreamt, spread
+    _, (dreamt, spread, beyond) = jax.lax.scan(imagined, jnp.asarray(starts), jax.random.split(key, length))
+    return predicted, disagreement(ensemble, jnp.asarray(starts), jnp.asarray(actions)[:, 0]), dreamt, spread, beyond

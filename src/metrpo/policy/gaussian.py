@@ -61,6 +61,15 @@ def kl(old_means: Array, old_log_std: Array, means: Array, log_std: Array, axis:
     return 0.5 * jnp.sum(ratio + distance - 1.0 + 2 * (log_std - old_log_std), axis=axis)
 
 
+LIMIT = 0.9
+"""Mean actions beyond this are said to saturate: their noise is clipped, so they have little gradient."""
+
+
+def excess(means: Array) -> Array:
+    """How far mean actions lie beyond `LIMIT`; signed."""
+    return means - jnp.clip(means, -LIMIT, LIMIT)
+
+
 def reset_std(policy: Policy, initial_std: float) -> Policy:
     """The policy with its standard deviation set back, as at the start of every policy phase."""
     return policy._replace(log_std=jnp.full(policy.log_std.shape, math.log(initial_std), jnp.float32))

@@ -139,13 +139,13 @@ def _trpo(
 def _ppo(
     config: Config, policy: Policy, moments: Any, batch: Batch, key: Array, axis: str | None
 ) -> tuple[Policy, Any, ImproveInfo]:
-    return ppo.improve(policy, moments, batch, config.ppo, config.gradient, key, axis)
+    return ppo.improve(policy, moments, batch, config.ppo, config.gradient, key, axis, config.policy.mean_penalty)
 
 
 def _vpg(
     config: Config, policy: Policy, moments: Any, batch: Batch, key: Array, axis: str | None
 ) -> tuple[Policy, Any, ImproveInfo]:
-    return vpg.improve(policy, moments, batch, config.gradient, axis)
+    return vpg.improve(policy, moments, batch, config.gradient, axis, config.policy.mean_penalty)
 
 
 IMPROVERS: dict[str, Improver] = {

@@ -17,12 +17,19 @@ from metrpo.policy.gaussian import Policy
 from metrpo.types import Array
 
 
-def clipped_surrogate(policy: Policy, batch: Batch, old_log_probability: Array, clip: float) -> Array:
-    """sum of min(ratio A, clip(ratio, 1 - clip, 1 + clip) A) over the steps of `batch` (their equation 7)."""
-    log_probability = gaussian.log_probability(gaussian.mean(policy, batch.states), policy.log_std, batch.actions)
+def clipped_surrogate(
+    policy: Policy, batch: Batch, old_log_probability: Array, clip: float, penalty: float = 0.0
+) -> Array:
+    """sum of min(ratio A, clip(ratio, 1 - clip, 1 + clip) A) over the steps of `batch` (their equation 7).
+
+    Less `penalty` times the squared excess of mean actions beyond [-1, 1].
+    """
+    means = gaussian.mean(policy, batch.states)
+    log_probability = gaussian.log_probability(means, policy.log_std, batch.actions)
+    cost = penalty * jnp.sum(jnp.square(gaussian.excess(means)), axis=-1) if penalty else 0.0
     ratio = jnp.exp(log_probability - old_log_probability)
     clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
-    return jnp.sum(batch.mask * jnp.minimum(ratio * batch.advantages, clipped * batch.advantages))
+    return jnp.sum(batch.mask * (jnp.minimum(ratio * batch.advantages, clipped * batch.advantages) - cost))
 
 
 def improve(
@@ -33,6 +40,7 @@ def improve(
     config: GradientConfig,
     key: Array,
     axis: str | None = None,
+    penalty: float = 0.0,
 ) -> tuple[Policy, Any, ImproveInfo]:
     """`ppo.epochs` passes over `batch`, shuffled anew in each by `key`; `moments` are Adam's.
 
@@ -48,7 +56,7 @@ def improve(
         policy, moments, sound = carry
         rows = jax.tree.map(partial(jnp.take, indices=index, axis=0), (batch, old_log_probability))
         count = jnp.maximum(across(jnp.sum(rows[0].mask), axis), 1.0)
-        gradient = across(jax.grad(clipped_surrogate)(policy, *rows, ppo.clip), axis)
+        gradient = across(jax.grad(clipped_surrogate)(policy, *rows, ppo.clip, penalty), axis)
         gradient = jax.tree.map(lambda g: g / count, gradient)
         policy, moments, made = ascend(policy, moments, gradient, config)
         return (policy, moments, sound & made), None
@@ -60,7 +68,8 @@ def improve(
     keys = jax.random.split(share_of(key, axis), ppo.epochs)
     (new, moments, sound), _ = jax.lax.scan(epoch, (policy, moments, jnp.bool_(True)), keys)
     count = jnp.maximum(across(jnp.sum(batch.mask), axis), 1.0)
-    gain = across(clipped_surrogate(new, batch, old_log_probability, ppo.clip), axis) / count
-    start = across(jnp.sum(batch.mask * batch.advantages), axis) / count
+    gain, start = (
+        across(clipped_surrogate(p, batch, old_log_probability, ppo.clip, penalty), axis) / count for p in (new, policy)
+    )
     kl = mean_kl(policy, new, batch.states, batch.mask, axis)
     return new, moments, by_gradient(kl, gain - start, sound)

@@ -34,7 +34,7 @@ def improve(
     at = linearise(policy.layers, states)
 
     def cost(means: Array, mask: Array) -> Array:
-        return penalty / count * jnp.sum(mask * jnp.square(_excess(means))) if penalty else jnp.float32(0)
+        return penalty / count * jnp.sum(mask * jnp.square(gaussian.excess(means))) if penalty else jnp.float32(0)
 
     def surrogate_and_kl(new: Policy) -> tuple[Array, Array]:
         log_std = new.log_std[:, None]
@@ -57,7 +57,7 @@ def improve(
     z = (actions - at.means) * jnp.exp(-old_log_std)
     rising = weights * z * jnp.exp(-old_log_std)
     if penalty:
-        rising = rising - 2 * penalty / count * mask * _excess(at.means)
+        rising = rising - 2 * penalty / count * mask * gaussian.excess(at.means)
     slope = Policy(pull_back(at, rising), jnp.sum(weights * (jnp.square(z) - 1.0), axis=(0, 2)))
     flat, unravel = ravel_pytree(policy)
     gradient = ravel_pytree(across(slope, axis))[0]
@@ -97,11 +97,6 @@ def improve(
         backtracks=tries,
         cg_residual=jnp.linalg.norm(residual) / jnp.maximum(norm, 1e-30),
     )
-
-
-def _excess(means: Array) -> Array:
-    """How far mean actions lie beyond [-1, 1], signed."""
-    return means - jnp.clip(means, -1.0, 1.0)
 
 
 def fisher_product(

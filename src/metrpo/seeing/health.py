@@ -23,6 +23,7 @@ CHECKS: tuple[Callable[[Sequence[Row], Config], Concern | None], ...] = (
     model_signs.diverged,
     policy_signs.updates_rejected,
     policy_signs.std_collapsed,
+    policy_signs.saturated,
     model_signs.models_blind,
     model_signs.member_apart,
     model_signs.loss_rises,

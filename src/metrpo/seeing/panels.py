@@ -28,6 +28,7 @@ _QUANTITIES = (
     ("rejected_steps", "Rejected updates", "of those tried, moved nothing", True),
     ("kl", "KL divergence", "mean over the updates", True),
     ("mean_std", "Standard deviation", "of the policy's actions", True),
+    ("saturated", "Saturated actions", "share of the policy's mean actions beyond the limits", True),
     ("diverged", "Diverged rollouts", "share of the imagined ones", True),
     ("error_1", "Model error, one step", "on held-out real steps; 1: no better than predicting no change", False),
     ("error_T", "Model error, an episode", "the same after a whole imagined episode", False),

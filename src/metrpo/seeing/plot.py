@@ -36,6 +36,7 @@ _NAMES = {
     "disagreement_real": "disagreement on real states (std)",
     "disagreement_imagined": "disagreement on imagined states (std)",
     "outside": "imagined states outside the data",
+    "saturated": "mean actions beyond the limits",
 }
 
 

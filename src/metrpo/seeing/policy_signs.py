@@ -19,8 +19,12 @@ STILL = 0.02
 """KL divergence of an update, in parts of the trust region."""
 REJECTED = 0.5
 """Share of the updates that moved nothing."""
+SATURATED = 0.5
+"""Share of the mean actions beyond the limits."""
 NEVER_ACCEPTED, NEVER_STOPPED, FLAT = 3, 8, 5
 """Iterations without an accepted update; up to max_updates; before a first gain is missed."""
+LAST, FEW = 10, 5
+"""So many of the last iterations, and so many of these without an accepted update."""
 
 
 def return_fell(rows: Sequence[Row], config: Config) -> Concern | None:
@@ -111,6 +115,22 @@ def std_collapsed(rows: Sequence[Row], config: Config) -> Concern | None:
     )
 
 
+def saturated(rows: Sequence[Row], config: Config) -> Concern | None:
+    """Most mean actions lie beyond the limits, where they are clipped and have no gradient."""
+    share = column(rows, "saturated")
+    since = since_when(rows, share > SATURATED)
+    if since is None:
+        return None
+    return Concern(
+        "policy-saturated",
+        "warning",
+        since,
+        f"{share[-1]:.0%} of the policy's mean actions beyond the limits",
+        "clipped actions have no gradient: the policy may stay in a local optimum",
+        "policy.normalise, a larger policy.mean_penalty, a wider policy.initial_std",
+    )
+
+
 def updates_rejected(rows: Sequence[Row], config: Config) -> Concern | None:
     """The optimiser moves the policy not at all, or hardly."""
     updates, rejected, kl = (column(rows, name) for name in ("updates", "rejected_steps", "kl"))
@@ -133,15 +153,19 @@ def updates_rejected(rows: Sequence[Row], config: Config) -> Concern | None:
 
 def nothing_accepted(rows: Sequence[Row], config: Config) -> Concern | None:
     """The models agree on no better policy."""
-    accepted = column(rows, "accepted_updates")
-    since = since_when(rows, accepted == 0)
-    if since is None or iteration_at(rows, -1) - since + 1 < NEVER_ACCEPTED:
+    nothing = column(rows, "accepted_updates") == 0
+    since = since_when(rows, nothing)
+    if since is not None and (count := int(iteration_at(rows, -1)) - since + 1) >= NEVER_ACCEPTED:
+        measured = f"No policy update accepted in {count} iterations"
+    elif len(nothing) >= LAST and (count := int(nothing[-LAST:].sum())) >= FEW:
+        since, measured = int(iteration_at(rows, -LAST)), f"No policy update accepted in {count} of {LAST} iterations"
+    else:
         return None
     return Concern(
         "nothing-accepted",
         "note",
         since,
-        f"No policy update accepted in {int(iteration_at(rows, -1) - since + 1)} iterations",
+        measured,
         "the policy stays as it is: the models see nothing better, or do not agree on it",
         "if the return is good, the run has converged; if not, more real steps, a longer validate.patience or a lower "
         "validate.threshold",
