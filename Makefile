@@ -9,6 +9,8 @@
 PYTHON ?=
 RUN_DIR ?=
 UV ?= uv
+# To the commands through their environment: it may have spaces in it.
+export RUN_DIR
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -23,7 +25,7 @@ help:  ## this list
 	@echo '  PYTHON=python3.12 chooses the interpreter that .venv is made with, RUN_DIR=runs/mine where `make train` writes.'
 
 train: $(READY)  ## learn Swimmer with the fast preset: a gait within 10 minutes on 2 cores
-	$(BIN)/metrpo train Swimmer $(if $(RUN_DIR),--run-dir $(RUN_DIR))
+	$(BIN)/metrpo train Swimmer $(if $(RUN_DIR),--run-dir "$$RUN_DIR")
 
 test: $(READY)  ## lint, types, import rules and the fast tests
 	$(BIN)/ruff check .

@@ -7,6 +7,7 @@ policy, mean of 20 episodes), the real steps they took, and the minutes of wall-
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ def row(system: Path) -> tuple[str, ...]:
 
     def over_seeds(values: list[float], digits: int = 1) -> str:
         if np.isnan(values).all():
-            return "-"  # nothing was played by this program: see examples/robot
+            return "-"  # a method without models has no gap, another program's run no return: see examples/robot
         spread = f" ({', '.join(f'{v:.{digits}f}' for v in values)})" if len(values) > 1 else ""
         return f"{np.mean(values):.{digits}f}{spread}"
 
@@ -39,11 +40,17 @@ def row(system: Path) -> tuple[str, ...]:
         system.name,
         str(len(runs)),
         f"{min(run[-1]['real_steps'] for run in runs):,}",
-        over_seeds([run[-1]["return_real"] for run in runs]),
-        over_seeds([max(r["return_real"] for r in run) for run in runs]),
-        over_seeds([run[-1]["gap"] for run in runs]),
-        over_seeds([run[-1]["wall_seconds"] / 60 for run in runs]),
+        over_seeds([_value(run[-1], "return_real") for run in runs]),
+        over_seeds([float(np.fmax.reduce([_value(r, "return_real") for r in run])) for run in runs]),
+        over_seeds([_value(run[-1], "gap") for run in runs]),
+        over_seeds([_value(run[-1], "wall_seconds") / 60 for run in runs]),
     )
+
+
+def _value(row: Mapping[str, float | None], column: str) -> float:
+    """A number of a row; NaN where it has none: a deterministic run keeps no clock."""
+    value = row.get(column)
+    return float("nan") if value is None else value
 
 
 def table(folders: list[Path]) -> str:

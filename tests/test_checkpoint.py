@@ -1,6 +1,7 @@
 """A checkpoint comes back exactly as it was, or not at all."""
 
 import os
+import re
 import zipfile
 from typing import Any, NamedTuple
 
@@ -166,10 +167,29 @@ def test_three_differences_are_named_and_the_others_counted(tmp_path, wrong, mor
     saved = {f"x{i}": np.zeros(2, np.float32) for i in range(8)}
     save_state(path, saved, {})
     template = {name: x.astype(np.float64) if i < wrong else x for i, (name, x) in enumerate(saved.items())}
-    with pytest.raises(RunDirectoryError, match="expected 8 arrays, got 8") as error:
+    with pytest.raises(RunDirectoryError, match="does not fit this run: it has") as error:
         load_state(path, template)
     named = [f"it has ['x{i}'] as float32 of rank 1 instead of float64 of rank 1" for i in range(min(wrong, 3))]
-    assert f"; {'; '.join(named)}{more}. It was written by" in str(error.value)
+    assert f" {'; '.join(named)}{more}; choose another directory (--run-dir)" in str(error.value)
+    assert "use that version" not in str(error.value), "this version wrote it"
+
+
+def test_a_task_of_another_size_is_named_as_such_and_not_as_another_version(tmp_path):
+    path = tmp_path / "a.npz"
+    save_state(path, {"x": np.zeros((2, 3), np.float32), "y": jnp.zeros(4)}, {})
+    with pytest.raises(RunDirectoryError, match="task's observations or actions have another size now") as error:
+        load_state(path, {"x": np.zeros((2, 5), np.float32), "y": jnp.zeros(4)})
+    assert "['x'] of shape [2, 3] instead of ['n', 5]" in str(error.value)
+    assert not re.search("use that version|expected 2 arrays", str(error.value))
+
+
+def test_another_version_is_named_where_it_wrote_other_arrays(tmp_path, monkeypatch):
+    path = tmp_path / "a.npz"
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "metrpo_version", lambda: "7.0")
+        save_state(path, {"x": np.zeros(2)}, {})
+    with pytest.raises(RunDirectoryError, match=r"lacks \['y'\]; it has unknown .* by metrpo '7.0': use that version"):
+        load_state(path, {"y": np.zeros(2)})
 
 
 def test_another_format_is_refused_by_name(tmp_path, monkeypatch):

@@ -16,9 +16,11 @@ import numpy as np
 import pytest
 
 import metrpo
+from metrpo import cli
 from metrpo.cli import main
 from metrpo.config import Config
-from metrpo.options import COMMANDS
+from metrpo.default_dir import default_run_dir
+from metrpo.options import COMMANDS, parse
 from metrpo.presets import preset
 from metrpo.run import directory, doctor, machine
 from metrpo.run.directory import RunDirectory
@@ -99,6 +101,50 @@ def test_the_same_command_goes_on_and_a_larger_budget_too(capsys):
     assert run("train", "Swimmer", "--iterations", "3", "--run-dir", "a") == 0
     assert "iteration 3/3" in capsys.readouterr().out
     assert [row["iteration"] for row in metrpo.read_metrics("a/metrics.csv")] == [1, 2, 3]
+
+
+TEN = ["--ensemble.members", "10"]
+
+
+def test_other_settings_have_another_directory_and_the_same_command_the_same(capsys):
+    """The README's own order: the usual run, then one with a setting of its own."""
+    usual, ten = "runs/Swimmer-fast-seed0", "runs/Swimmer-fast-seed0-ensemble.members=10"
+    for command, where, iterations in (
+        (["Swimmer"], usual, 1),
+        (["Swimmer", *TEN], ten, 1),
+        (["Swimmer", *TEN], ten, 2),
+    ):
+        assert run("train", *command, "--iterations", str(iterations)) == 0
+        assert f"{where}/policy.npz" in capsys.readouterr().out
+        assert len(metrpo.read_metrics(f"{where}/metrics.csv")) == iterations
+    assert sorted(path.name for path in Path("runs").iterdir()) == [Path(usual).name, Path(ten).name]
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ([], "Swimmer-fast-seed0"),
+        (["--iterations", "7"], "Swimmer-fast-seed0"),
+        (["--system", "k-1", "--seed", "3"], "Swimmer-k-1-fast-seed3"),
+        (["--trpo.max-kl", "0.02", "--deterministic"], "Swimmer-fast-seed0-deterministic=True,trpo.max_kl=0.02"),
+        (["--ensemble.hidden", "64", "32"], "Swimmer-fast-seed0-ensemble.hidden=64x32"),
+        (["--data", "logs/a b.npz"], "Swimmer-fast-seed0-data=logs-a-b.npz"),
+        ([*TEN, "--seed", "1", "--fit.max-steps", "9", "--imagine.steps", "8", "--trpo.max-kl", "1"], "4-settings-"),
+    ],
+)
+def test_the_default_directory_is_named_after_what_is_changed(options, name):
+    config, path = cli._run(parse(["train", "Swimmer", *options]))
+    assert (path.name == f"Swimmer-fast-seed0{name}") or path.name == name or "settings" in name
+    if "settings" in name:
+        assert re.fullmatch(r"Swimmer-fast-seed1-4-settings-[0-9a-f]{8}", path.name)
+        other = dataclasses.replace(config, trpo=dataclasses.replace(config.trpo, max_kl=2.0))
+        assert default_run_dir(other) != path == default_run_dir(dataclasses.replace(config, iterations=99))
+
+
+def test_a_run_that_an_older_version_put_elsewhere_goes_on_there(capsys):
+    assert run("train", "Swimmer", *TEN, "--iterations", "1", "--run-dir", "runs/Swimmer-fast-seed0") == 0
+    assert run("train", "Swimmer", *TEN, "--iterations", "2") == 0
+    assert [path.name for path in Path("runs").iterdir()] == ["Swimmer-fast-seed0"]
 
 
 def test_settings_start_from_the_preset_of_the_task():

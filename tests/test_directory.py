@@ -263,6 +263,28 @@ def test_changed_settings_are_refused_with_the_difference(tmp_path):
     train(tmp_path, until=2)  # the refused attempt let go of the lock
 
 
+def test_a_run_that_died_before_its_first_episode_claims_nothing(tmp_path):
+    other = dataclasses.replace(CONFIG, seed=CONFIG.seed + 1)
+    with RunDirectory(tmp_path, CONFIG) as run:
+        run.load(a_state())
+    (tmp_path / "checkpoints").mkdir(exist_ok=True)
+    (tmp_path / "checkpoints" / ".iteration-00001.tmp.npz").write_bytes(b"half")
+    assert train(tmp_path, other, until=1) == [1]
+    assert (tmp_path / "config.json").read_text() == to_json(other)
+    with pytest.raises(RunDirectoryError, match=rf"--run-dir DIR\).*delete {tmp_path} first"):
+        train(tmp_path, CONFIG)
+
+
+@pytest.mark.parametrize("kept", ["episodes/run-000000.npz", "checkpoints/iteration-00001.npz.damaged", "metrics.csv"])
+def test_a_run_with_anything_to_lose_keeps_its_claim(tmp_path, kept):
+    with RunDirectory(tmp_path, CONFIG) as run:
+        run.load(a_state())
+    (tmp_path / kept).parent.mkdir(exist_ok=True)
+    (tmp_path / kept).write_text("")
+    with pytest.raises(RunDirectoryError, match="other settings"):
+        train(tmp_path, dataclasses.replace(CONFIG, seed=CONFIG.seed + 1))
+
+
 def test_the_budget_may_change(tmp_path):
     train(tmp_path, until=1)
     more = dataclasses.replace(CONFIG, iterations=9)

@@ -334,6 +334,24 @@ def test_a_directory_in_the_way_is_named(tmp_path):
     assert not list(tmp_path.glob(".*"))
 
 
+@pytest.mark.parametrize(
+    ("name", "better"),
+    [
+        ("2swim-policy", "swim_policy"),
+        ("my-policy", "my_policy"),
+        ("class", "class_policy"),
+        ("numpy", "numpy_policy"),
+        ("007", "my_policy"),
+    ],
+)
+def test_a_name_that_python_cannot_import_is_refused_with_a_better_one(name, better, tmp_path):
+    saved(tmp_path)
+    with pytest.raises(MetrpoError, match=rf"can import, such as {better}\.py, got {name}\.py"):
+        export(tmp_path, tmp_path / f"{name}.py")
+    assert not (tmp_path / f"{name}.py").exists()
+    assert export(tmp_path, tmp_path / f"{name}.npz").exists(), "only Python imports"
+
+
 def test_somebody_elses_script_is_not_overwritten(tmp_path):
     saved(tmp_path)
     mine = tmp_path / "train.py"

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import subprocess
 import sys
 
@@ -11,7 +12,8 @@ import pytest
 
 from metrpo.errors import RunDirectoryError
 from metrpo.policy import gaussian
-from metrpo.run.files import write_arrays
+from metrpo.run.directory import stored_config
+from metrpo.run.files import read_arrays, write_arrays
 from metrpo.run.policy_file import load_policy, save_policy
 
 S, A, HIDDEN = 5, 2, (8, 6)
@@ -86,7 +88,46 @@ def test_no_policy_says_how_to_get_one(tmp_path):
 def test_a_damaged_policy_is_refused(loaded, tmp_path):
     path = tmp_path / "policy.npz"
     path.write_bytes(path.read_bytes()[:-1])
-    with pytest.raises(RunDirectoryError, match=r"policy\.npz is damaged"):
+    with pytest.raises(RunDirectoryError, match=r"policy\.npz is damaged") as error:
+        load_policy(tmp_path)
+    path.write_bytes(path.read_bytes()[:400])
+    with pytest.raises(RunDirectoryError, match=r"got none: its end is missing") as error:
+        load_policy(tmp_path)
+    assert "\\x" not in str(error.value), "no raw bytes"
+
+
+def test_a_folder_of_runs_names_one_and_does_not_ask_to_train_into_it(loaded, tmp_path):
+    (tmp_path / "runs").mkdir()
+    os.rename(tmp_path / "policy.npz", tmp_path / "runs" / "policy.npz")
+    with pytest.raises(RunDirectoryError, match=rf"name one of them, such as {tmp_path}/runs$") as error:
+        load_policy(tmp_path)
+    assert "metrpo train" not in str(error.value)
+    (tmp_path / "begun").mkdir()
+    (tmp_path / "begun" / "config.json").write_text("{}")
+    with pytest.raises(RunDirectoryError, match="first iteration is not finished") as error:
+        load_policy(tmp_path / "begun")
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(RunDirectoryError, match=r"expected the file .*mine\.npz, got none"):
+        load_policy(tmp_path / "mine.npz")
+    (tmp_path / "a/b").mkdir(parents=True)
+    (tmp_path / "a/b/config.json").write_text("{}")
+    with pytest.raises(RunDirectoryError, match=rf"got a folder of runs, such as {tmp_path}/a/b"):
+        stored_config(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda arrays: arrays.update(extra=np.zeros(1, np.float32)), "got 'extra' besides"),
+        (lambda arrays: arrays.pop("b0"), "b0 is missing"),
+        (lambda arrays: arrays.update(log_std=np.zeros(7, np.float32)), r"got log_std of \[7\] instead of \[2\]"),
+    ],
+)
+def test_the_array_that_does_not_fit_is_named(loaded, tmp_path, change, said):
+    arrays, meta = read_arrays(tmp_path / "policy.npz")
+    change(arrays)
+    write_arrays(tmp_path / "policy.npz", arrays, {"policy": meta["policy"]})
+    with pytest.raises(RunDirectoryError, match=said):
         load_policy(tmp_path)
 
 

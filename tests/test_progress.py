@@ -8,7 +8,7 @@ import time
 import pytest
 from rich.console import Console
 
-from metrpo.run.progress import SILENT, LiveProgress, PlainProgress, default_progress, duration
+from metrpo.run.progress import SILENT, Guarded, LiveProgress, PlainProgress, default_progress, duration
 
 ROW = {
     "iteration": 1,
@@ -33,6 +33,26 @@ def play(progress, pause=0.0):
     progress.stage("collect", 3000)
     progress.close()
     progress.close()
+
+
+@pytest.mark.parametrize(
+    ("iteration", "of", "said"),
+    [
+        (5, 20, "resuming runs/[a] at iteration 5 of 20, 12,000 real steps"),
+        (5, None, "resuming runs/[a] at iteration 5, 12,000 real steps"),
+        (5, 4, "runs/[a] is finished: 4 iterations, 12,000 real steps; a larger budget goes on"),
+    ],
+)
+def test_a_resumed_run_says_so(iteration, of, said):
+    out = io.StringIO()
+    for progress in (
+        PlainProgress(out),
+        Guarded(PlainProgress(out)),
+        LiveProgress(Console(file=out, width=30)),
+        SILENT,
+    ):
+        progress.resume("runs/[a]", iteration, of, 12_000)
+    assert out.getvalue().splitlines() == [said] * 3
 
 
 def test_plain_lines_are_one_per_stage_and_one_per_iteration():

@@ -19,6 +19,17 @@ ROOT = Path(__file__).resolve().parents[1]
 RUNS = sorted(path.parent for path in (ROOT / "results").glob("*/*/*/seed-*/metrics.csv"))
 
 
+def test_the_table_script_takes_every_committed_run():
+    """Those of methods without models, which have no gap, too."""
+    script = runpy.run_path(str(ROOT / "benchmarks" / "summarise.py"))
+    table = script["table"]([ROOT / "results"])
+    assert table.count("\n") > 50
+    for system in ("ppo", "ddpg", "trpo", "svg-inf"):
+        (row,) = [line for line in table.splitlines() if line.startswith(f"| laptop | Swimmer | {system} |")]
+        assert row.split(" | ")[7] == "-", "no gap"
+    assert "nan" not in table
+
+
 def test_there_are_results():
     assert len(RUNS) >= 3
 

@@ -52,17 +52,31 @@ def test_a_table_of_runs(tmp_path):
         )
         text = printed([tmp_path])
     lines = text.splitlines()
-    for name in ("task", "seed", "iteration", "return", "best", "gap", "so far", "warnings", "s/iteration", "left"):
+    for name in (
+        "run",
+        "task",
+        "preset",
+        "seed",
+        "iteration",
+        "return",
+        "best",
+        "gap",
+        "so far",
+        "warnings",
+        "s/iteration",
+        "left",
+    ):
         assert name in lines[0]
-    running, *stopped, finished = [line.split() for line in lines if line.startswith("Swimmer")]
-    assert running[:5] == ["Swimmer", "me-trpo", "7", "10/20", "30,000"]
+    running, *stopped, finished = [line.split() for line in lines if "Swimmer" in line]
+    assert running[:7] == ["running", "Swimmer", "me-trpo", "fast", "7", "10/20", "30,000"]
+    assert [line[0] for line in stopped] == ["stopped", "x"]
     assert running[-1] == "running", "running ones first"
     # (2 * 100 - 2 * 49) / 3 seconds an iteration, ten to go
     assert "34.0" in running
     assert " ".join(running[-5:-1]).endswith("5 min 40 s")
-    assert running[9] == "2", "two warnings"
+    assert running[11] == "2", "two warnings"
     assert all("stopped" in line and line[-1] == "ago" for line in stopped)
-    assert finished[2] == "3"
+    assert finished[4] == "3"
     assert finished[-1] == "finished"
     assert f"cannot be read: {tmp_path}/bad/config.json" in text
     assert "\x1b" not in text, "no control codes where there is no terminal"
@@ -81,6 +95,38 @@ def test_json_says_the_same(tmp_path, capsys):
     assert a["returns"] == [pytest.approx(r["return_real"]) for r in TIMED]
     assert (b["iteration"], b["iterations"], b["return_real"], b["returns"]) == (0, None, None, [])
     assert said["skipped"] == []
+
+
+def test_what_tells_runs_apart_is_shown(tmp_path, capsys):
+    more = dataclasses.replace(CONFIG, ensemble=dataclasses.replace(CONFIG.ensemble, members=10))
+    a_run(tmp_path / "runs/sizes/five", CONFIG, TIMED)
+    a_run(tmp_path / "runs/sizes/ten", more, TIMED)
+    a_run(tmp_path / "runs/paper", dataclasses.replace(CONFIG, preset="paper"), TIMED)
+    text = printed([tmp_path / "runs"], 200)
+    assert "changed" in text
+    for name, preset, changed in (
+        ("sizes/five", "fast", "ensemble.members=5"),
+        ("sizes/ten", "fast", "ensemble.members=10"),
+        ("paper", "paper", ""),
+    ):
+        (line,) = [line for line in text.splitlines() if line.startswith(f"{name} ")]
+        assert preset in line.split()
+        assert changed in line
+        assert ("ensemble.members" in line) == bool(changed)
+    assert "changed" not in printed([tmp_path / "runs/paper"], 200), "nothing to be told from"
+    assert main(["watch", "runs", "--json"]) == 0
+    said = {Path(run["path"]).name: run["changed"] for run in json.loads(capsys.readouterr().out)["runs"]}
+    assert said == {"paper": {}, "five": {"ensemble.members": "5"}, "ten": {"ensemble.members": "10"}}
+
+
+def test_a_robots_run_shows_what_was_collected(tmp_path):
+    nothing = {"return_real": None, "gap": None}
+    rows = [r | nothing | {"return_collected": 5.0 * r["iteration"]} for r in TIMED]
+    a_run(tmp_path / "robot", CONFIG, rows)
+    line = printed([tmp_path], 200).splitlines()[-1]
+    assert "50.0 collected" in line
+    assert SPARKS[-1] in line
+    assert standing(read(tmp_path / "robot")).return_collected == 50.0
 
 
 def test_the_command_prints_once_and_refuses_what_makes_no_sense(tmp_path, capsys):
@@ -309,6 +355,37 @@ def test_a_mean_curve_is_where_all_seeds_are(tmp_path):
     (none,) = group(find([tmp_path / "z"]).runs)
     assert len(curve(none, "real_steps", "return_real").x) == 0
     assert len(curve(none, "real_steps", "return_real").seeds) == 2
+
+
+@pytest.mark.parametrize(("log", "log_y"), [(False, False), (True, False), (False, True), (True, True)])
+def test_the_band_of_two_seeds_contains_their_lines_as_they_are_drawn(tmp_path, log, log_y):
+    """Between its points a line is straight on the axes, logarithmic ones too."""
+    for seed, (steps, values) in enumerate([([1000, 50_000], [0.01, 0.9]), ([900, 2000, 60_000], [1.0, 0.02, 0.5])]):
+        rows = [
+            {"iteration": i, "real_steps": s, "return_real": v}
+            for i, (s, v) in enumerate(zip(steps, values, strict=True))
+        ]
+        a_run(tmp_path / str(seed), dataclasses.replace(CONFIG, seed=seed), rows)
+    (only,) = group(find([tmp_path]).runs)
+    c = curve(only, "real_steps", "return_real", log, log_y)
+    across, up = (np.log if is_log else np.asarray for is_log in (log, log_y))
+    fine = np.linspace(across(1000), across(50_000), 4001)
+    low, high = (np.interp(fine, across(c.x), up(band)) for band in (c.low, c.high))
+    for xs, ys in c.seeds:
+        line = np.interp(fine, across(xs), up(ys))
+        assert np.all(low <= line + 1e-9)
+        assert np.all(line <= high + 1e-9)
+    # No wider than needed, but for where the lines cross between two points of the grid.
+    both = np.array([np.interp(fine, across(xs), up(ys)) for xs, ys in c.seeds])
+    assert np.median(np.abs(high - both.max(axis=0))) < 1e-9
+
+
+def test_points_that_a_logarithmic_axis_does_not_have_are_left_out(tmp_path):
+    rows = [{"iteration": i, "real_steps": 1000 * i, "return_real": [0.5, 0.1, 0.2][i]} for i in range(3)]
+    a_run(tmp_path / "a", CONFIG, rows)
+    (only,) = group(find([tmp_path]).runs)
+    assert len(curve(only, "real_steps", "return_real").x) == 3
+    assert list(curve(only, "real_steps", "return_real", log=True).x) == [1000, 2000]
 
 
 @pytest.mark.parametrize("command", ["report", "plot", "watch"])

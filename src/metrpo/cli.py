@@ -130,12 +130,10 @@ def _say(text: str) -> None:
 
 def _run(command: Run) -> tuple[Config, Path]:
     """The settings, and where the run lives."""
-    from metrpo.run.files import folder_name
+    from metrpo.default_dir import default_run_dir
 
     config = Config(**{f.name: getattr(command, f.name) for f in dataclasses.fields(Config)})
-    system = "" if config.system == "me-trpo" else f"{config.system}-"
-    task = folder_name(config.task)
-    return config, command.run_dir or Path("runs") / f"{task}-{system}{config.preset}-seed{config.seed}"
+    return config, command.run_dir or default_run_dir(config)
 
 
 def _init(command: Init) -> int:
@@ -389,11 +387,11 @@ def _tell_skipped(skipped: Sequence[Mapping[str, Any]]) -> None:
 
 def _watch(command: Watch) -> int:
     from metrpo.seeing.runs import find
-    from metrpo.seeing.watch import standing, watch
+    from metrpo.seeing.watch import standings_of, watch
 
     if command.json:
         found = find(command.dirs)
-        runs = [dataclasses.asdict(standing(run)) for run in found.runs]
+        runs = [dataclasses.asdict(run) for run in standings_of(found.runs)]
         skipped = [{"path": str(path), "why": why} for path, why in found.skipped]
         print(json.dumps({"runs": runs, "skipped": skipped}))
         return 0

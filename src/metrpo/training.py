@@ -75,6 +75,10 @@ def train(config: Config, run_dir: str | Path | None = None, progress: Progress 
         state = run.load(template)
         if state is None:
             check(config)
+        elif state.iteration or state.real_steps:
+            left = _iterations_left(config, state)
+            of = None if left is None else state.iteration + max(left, 0)
+            progress.resume(str(run_dir), state.iteration + 1, of, state.real_steps)
         return _loop(config, state or template, progress, run.save, run.episodes)
 
 

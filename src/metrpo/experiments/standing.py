@@ -7,7 +7,7 @@ from pathlib import Path
 
 from metrpo.experiments.figures import Run
 from metrpo.run.metrics import Row, read_metrics
-from metrpo.run.progress import duration
+from metrpo.run.progress import duration, earned
 
 Tell = Callable[[str], None]
 _TAIL = 5
@@ -30,7 +30,7 @@ def has_spent(run: Run, rows: Sequence[Row]) -> bool:
     config = run.config
     if not rows:
         return False
-    if config.real_steps is not None:
+    if config.real_steps:  # 0: learns from a log, for so many iterations
         return int(rows[-1]["real_steps"] or 0) >= config.real_steps
     return int(rows[-1]["iteration"] or 0) >= config.iterations
 
@@ -39,8 +39,11 @@ def standing(run: Run, rows: Sequence[Row]) -> str:
     """How far the run has got."""
     if not rows:
         return "in its first iteration"
-    last, of = rows[-1], run.config.iterations
-    return f"iteration {last['iteration']}/{of}, {last['real_steps']:,} real steps, return {last['return_real']:.1f}"
+    last, budget, config = rows[-1], "", run.config
+    if config.real_steps:
+        budget = f" of {config.real_steps:,}"
+    of = "" if config.real_steps else f"/{config.iterations}"
+    return f"iteration {last['iteration']}{of}, {last['real_steps']:,}{budget} real steps, {earned(last)}"
 
 
 def words(run: Run, directory: Path) -> list[str]:

@@ -94,18 +94,34 @@ def steps_to_reach(steps: Array, returns: Array, level: float) -> float:
     return float(steps[last - 1] + share * (steps[last] - steps[last - 1]))
 
 
-def at_steps(curves: Sequence[tuple[Array, Array]], grid: Array) -> np.ndarray:
+def at_steps(curves: Sequence[tuple[Array, Array]], grid: Array, log: bool = False, log_y: bool = False) -> np.ndarray:
     """Learning curves at common real steps: [(steps [points], returns [points]), ...], `grid` [G] -> [curves, G].
 
-    On straight lines between the points; NaN before a curve's first point and after its last. Raises `ValueError`
-    unless steps increase from point to point.
+    On lines between the points that are straight where steps (`log`) or returns (`log_y`) stand on a logarithmic axis;
+    NaN before a curve's first point and after its last. Raises `ValueError` unless steps increase from point to point.
     """
-    return np.array([np.interp(grid, *_curve(*curve), left=np.nan, right=np.nan) for curve in curves])
+    across, up = (np.log if is_log else np.asarray for is_log in (log, log_y))
+    lines = [_curve(*curve) for curve in curves]
+    values = np.array([np.interp(across(grid), across(x), up(y), left=np.nan, right=np.nan) for x, y in lines])
+    return np.exp(values) if log_y else values
 
 
-def mean_band(curves: Sequence[tuple[Array, Array]], grid: Array) -> tuple[np.ndarray, Array, Array]:
+def common_grid(curves: Sequence[tuple[Array, Array]], points: int, log: bool = False) -> np.ndarray:
+    """Real steps at which all these curves are measured: so many at equal distances (of their logarithm with `log`).
+
+    The curves' own points are among them: there a line bends, and the band of two must contain both.
+    """
+    first, last = max(steps[0] for steps, _ in curves), min(steps[-1] for steps, _ in curves)
+    even = (np.geomspace if log else np.linspace)(first, last, points)
+    own = np.concatenate([np.asarray(steps, np.float64) for steps, _ in curves])
+    return np.unique(np.clip([*even, *own], first, last))
+
+
+def mean_band(
+    curves: Sequence[tuple[Array, Array]], grid: Array, log: bool = False, log_y: bool = False
+) -> tuple[np.ndarray, Array, Array]:
     """Mean of learning curves (see `at_steps`) [G], and its 95 % bootstrap interval [G], [G] (of two, their range)."""
-    values = at_steps(curves, grid)
+    values = at_steps(curves, grid, log, log_y)
     low, high = stratified_bootstrap(lambda scores: np.mean(scores[0], axis=0), [values], repetitions=500)
     return values.mean(axis=0), low, high
 

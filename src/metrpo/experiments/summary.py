@@ -12,6 +12,7 @@ from metrpo.experiments.figures import FIGURES, Run
 from metrpo.experiments.standing import rows_of
 from metrpo.experiments.statistics import (
     at_steps,
+    common_grid,
     iqm,
     mean_band,
     probability_of_improvement,
@@ -53,12 +54,11 @@ def curves_of(figure: str, runs: Sequence[Run], out: Path) -> list[Curves]:
 def mean_curve(curves: Curves, column: str, log: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Real steps [G], mean over seeds [G], and its 95 % bootstrap interval [G], [G] (of two seeds: their range).
 
-    Where all seeds have been measured; the steps are equal parts of the range, of its logarithm with `log`.
+    Where all seeds have been measured; with `log` as lines between the points are drawn on a logarithmic axis.
     """
     seeds = curves.column(column)
-    first, last = max(steps[0] for steps, _ in seeds), min(steps[-1] for steps, _ in seeds)
-    grid = np.geomspace(first, last, GRID) if log else np.linspace(first, last, GRID)
-    return grid, *mean_band(seeds, grid)
+    grid = common_grid(seeds, GRID, log)
+    return grid, *mean_band(seeds, grid, log)
 
 
 def summarise(figure: str, runs: Sequence[Run], out: Path) -> list[dict[str, Any]]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from metrpo.errors import RunDirectoryError
-from metrpo.run.files import read_arrays, write_arrays
+from metrpo.run.files import metrpo_version, read_arrays, write_arrays
 from metrpo.untrusted import brief
 
 Tree = TypeVar("Tree")
@@ -38,20 +38,32 @@ def load_state(path: Path, template: Tree) -> tuple[Tree, dict[str, Any]]:
     """
     arrays, meta = read_arrays(path)
     expected = dict(_named_leaves(template))
-    wrong = [f"lacks {n}" for n in expected if n not in arrays] + [
-        f"has unknown {n}" for n in arrays if n not in expected
-    ]
-    wrong += [_mismatch(n, leaf, arrays[n]) for n, leaf in expected.items() if n in arrays]
-    wrong = [w for w in wrong if w]
+    wrong = [f"lacks {n}" for n in expected if n not in arrays]
+    wrong += [f"has unknown {n}" for n in arrays if n not in expected]
+    wrong += [w for n, leaf in expected.items() if n in arrays and (w := _mismatch(n, leaf, arrays[n]))]
     if wrong:
-        more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
-        raise RunDirectoryError(
-            f"{path} does not fit this run: expected {len(expected)} arrays, got {len(arrays)}; "
-            f"it {'; it '.join(wrong[:3])}{more}. It was written by metrpo {brief(meta.get('metrpo'))}: use that "
-            "version, or another directory"
-        )
+        resized = not any(_is_other(n, leaf, arrays) for n, leaf in expected.items()) and len(arrays) == len(expected)
+        raise RunDirectoryError(f"{path} does not fit this run: {_advice(wrong, resized, meta.get('metrpo'))}")
     leaves = [_like(leaf, arrays[name]) for name, leaf in expected.items()]
     return jax.tree.unflatten(jax.tree.structure(template), leaves), meta
+
+
+def _is_other(name: str, leaf: Any, arrays: Mapping[str, np.ndarray]) -> bool:
+    """Whether the file lacks `name`, or has it as something that is not only of another size."""
+    return name not in arrays or _kind(leaf) != (arrays[name].dtype, arrays[name].ndim)
+
+
+def _advice(wrong: list[str], resized: bool, writer: Any) -> str:
+    more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
+    said = f"it {'; it '.join(wrong[:3])}{more}"
+    if resized:
+        return (
+            f"{said}. The task's observations or actions have another size now: give it the old ones, "
+            "or choose another directory (--run-dir)"
+        )
+    if writer == metrpo_version():
+        return f"{said}; choose another directory (--run-dir)"
+    return f"{said}. It was written by metrpo {brief(writer)}: use that version, or another directory (--run-dir)"
 
 
 def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
@@ -59,7 +71,7 @@ def _named_leaves(tree: Any) -> list[tuple[str, Any]]:
 
 
 def _mismatch(name: str, leaf: Any, array: np.ndarray) -> str:
-    kind, rank = (leaf.dtype, leaf.ndim) if hasattr(leaf, "dtype") else (np.asarray(leaf).dtype, 0)
+    kind, rank = _kind(leaf)
     if (kind, rank) != (array.dtype, array.ndim):
         return f"has {name} as {array.dtype} of rank {array.ndim} instead of {kind} of rank {rank}"
     grows = isinstance(leaf, np.ndarray)
@@ -67,6 +79,10 @@ def _mismatch(name: str, leaf: Any, array: np.ndarray) -> str:
     if expected[grows:] != array.shape[grows:]:
         return f"has {name} of shape {list(array.shape)} instead of {['n', *expected[1:]] if grows else list(expected)}"
     return ""
+
+
+def _kind(leaf: Any) -> tuple[Any, int]:
+    return (leaf.dtype, leaf.ndim) if hasattr(leaf, "dtype") else (np.asarray(leaf).dtype, 0)
 
 
 def _like(leaf: Any, array: np.ndarray) -> Any:

@@ -30,6 +30,8 @@ class DirectoryInUse(RunDirectoryError):
 def claim(path: Path, config: Config) -> TextIO:
     """Makes `path` the run directory of `config`, or checks that it is; returns its lock, held until closed.
 
+    A run that ended before it had an episode or a checkpoint has nothing to lose: its settings are replaced.
+
     Raises `RunDirectoryError` when it cannot be written, is in use by another process, holds something else, a run of
     another version or one with other settings; nothing in it has been changed then.
     """
@@ -37,7 +39,7 @@ def claim(path: Path, config: Config) -> TextIO:
     lock = hold(path)
     try:
         _check_or_describe(path / "run.json")
-        _check_or_write_config(path / "config.json", config, any(path.glob("checkpoints/*.npz")))
+        _check_or_write_config(path / "config.json", config, _has_begun(path))
     except BaseException:
         lock.close()
         raise
@@ -71,7 +73,7 @@ def _create(path: Path) -> None:
     if foreign and "run.json" not in foreign:
         raise RunDirectoryError(
             f"{path} is no run directory: expected it empty or with a run.json, got {', '.join(sorted(foreign)[:3])}; "
-            "choose another directory"
+            f"choose another directory (--run-dir), such as {path / 'new'}"
         )
 
 
@@ -114,9 +116,15 @@ def _check_or_describe(file: Path) -> None:
     atomic_write(file, json.dumps(about, indent=2) + "\n")
 
 
-def _check_or_write_config(file: Path, config: Config, started: bool) -> None:
+def _has_begun(path: Path) -> bool:
+    """Whether the run in `path` has anything to lose."""
+    kept = [*path.glob("checkpoints/*.npz*"), *path.glob("episodes/*.npz*")]
+    return (path / "metrics.csv").exists() or any(".tmp" not in file.name for file in kept)
+
+
+def _check_or_write_config(file: Path, config: Config, begun: bool) -> None:
     if not file.exists():
-        if started:
+        if begun:
             raise RunDirectoryError(f"{file} is missing: put it back or choose another directory")
         atomic_write(file, configs.to_json(config))
         return
@@ -124,10 +132,13 @@ def _check_or_write_config(file: Path, config: Config, started: bool) -> None:
         stored = configs.from_json(text_of(file, ConfigError))
     except ConfigError as error:
         raise RunDirectoryError(f"{file} is damaged: {error}; put it back or choose another directory") from None
-    require_same(stored, config, file)
+    if begun:
+        require_same(stored, config, file, file.parent)
+    elif configs.difference(stored, config):
+        atomic_write(file, configs.to_json(config))
 
 
-def require_same(stored: Config, asked: Config, where: Path | str) -> None:
+def require_same(stored: Config, asked: Config, where: Path | str, folder: Path) -> None:
     """Raises `RunDirectoryError` with a table of the settings in which `where` differs from what was asked for."""
     changed = configs.difference(stored, asked)
     if changed:
@@ -136,5 +147,6 @@ def require_same(stored: Config, asked: Config, where: Path | str) -> None:
             f"  {name:<{width}}  directory has {old}, asked for {new}" for name, (old, new) in changed.items()
         )
         raise RunDirectoryError(
-            f"{where} holds a run with other settings:\n{table}\nask for the same settings, or choose another directory"
+            f"{where} holds a run with other settings:\n{table}\nask for the same settings, choose another directory "
+            f"(--run-dir DIR), or begin anew: delete {folder} first"
         )

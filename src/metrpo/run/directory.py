@@ -32,7 +32,7 @@ from metrpo.errors import ConfigError, RunDirectoryError
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.claim import claim, require_same
 from metrpo.run.episodes import EpisodeLog
-from metrpo.run.files import DamagedFile, atomic_write, writing
+from metrpo.run.files import DamagedFile, atomic_write, inside, writing
 from metrpo.run.metrics import (
     Events,
     Row,
@@ -173,7 +173,7 @@ class RunDirectory:
             except DamagedFile as error:
                 damaged.append((path, error))
                 continue
-            require_same(_config(path, meta), self.config, f"{path}, unlike config.json,")
+            require_same(_config(path, meta), self.config, f"{path}, unlike config.json,", self.path)
             for old, why in damaged:
                 _log.warning("%s; going on from %s, the damaged file is kept as %s.damaged", why, path.name, old.name)
                 with writing(aside := old.with_name(f"{old.name}.damaged")):
@@ -306,6 +306,8 @@ def stored_config(run_dir: str | Path) -> Config:
     file = Path(run_dir) / "config.json"
     try:
         if not file.exists():
+            if run := inside(Path(run_dir), file.name):
+                raise RunDirectoryError(f"{run_dir}: expected one run's directory, got a folder of runs, such as {run}")
             raise RunDirectoryError(
                 f"{run_dir} holds no run: expected {file}; start one with: metrpo init TASK --run-dir {run_dir}"
             )

@@ -8,9 +8,11 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import re
 import textwrap
 from collections.abc import Callable
 from dataclasses import asdict
+from keyword import iskeyword
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -23,6 +25,8 @@ from metrpo.run.policy_file import FILE, LoadedPolicy, load_policy
 from metrpo.untrusted import opened
 
 _Writer = Callable[[LoadedPolicy, Path], bytes | str]
+_IMPORTED = ("base64", "hashlib", "numpy")
+"""By the exported file: one of these names would be that file itself."""
 _OPSET = 13
 """Of 2020: nearly every runtime in use reads it."""
 
@@ -32,18 +36,31 @@ def export(run_dir: Path, out: Path | None = None) -> Path:
 
     All three map observations [B, S] to actions [B, A] in [-1, 1], as `load_policy` does; the .py also [S] to [A].
 
-    Raises `MetrpoError` for another ending, a .py file in the way that is not ours, or when the onnx package is
-    missing, `RunDirectoryError` when there is no policy, it is damaged, or `out` cannot be written.
+    Raises `MetrpoError` for another ending, a name that Python cannot import, a .py file in the way that is not ours,
+    or when the onnx package is missing, `RunDirectoryError` when there is no policy, it is damaged, or `out` cannot be
+    written.
     """
     source = run_dir if run_dir.suffix == ".npz" else run_dir / FILE
     out = source.with_name("policy.py") if out is None else out
     if out.suffix not in _WRITERS:
         raise MetrpoError(f"{out}: expected a name that ends in {', '.join(_WRITERS)}; got {out.suffix or 'no ending'}")
+    if out.suffix == ".py":
+        _require_importable(out)
     policy = load_policy(run_dir)
     if out.suffix == ".py" and out.is_file() and not _is_ours(out):
         raise MetrpoError(f"{out} exists and is no exported policy: choose another name, or remove it first")
     atomic_write(out, _WRITERS[out.suffix](policy, source))
     return out
+
+
+def _require_importable(out: Path) -> None:
+    """Raises `MetrpoError` for a file that no `import` can name, or that stands in the way of what it imports."""
+    name = out.stem
+    if name.isidentifier() and not iskeyword(name) and name not in _IMPORTED:
+        return
+    better = re.sub(r"\W+", "_", name).strip("_").lstrip("0123456789_")
+    better = better if better.isidentifier() and better != name else f"{better or 'my'}_policy"
+    raise MetrpoError(f"{out}: expected a name that Python can import, such as {better}.py, got {out.name}")
 
 
 def _is_ours(path: Path) -> bool:

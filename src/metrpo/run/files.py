@@ -107,7 +107,7 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     with opened(path, RunDirectoryError) as file:
         found, expected = _digests(file)
         if found != expected:
-            got = ascii(found[:16].decode("latin-1"))[1:-1] or "nothing"
+            got = found.decode("latin-1")[:16] if re.fullmatch(rb"[0-9a-f]{64}", found) else "none: its end is missing"
             raise DamagedFile(
                 f"{path} is damaged (truncated or edited): expected SHA-256 {expected.decode()[:16]} at its end, "
                 f"got {got}"
@@ -131,6 +131,15 @@ def check_format(meta: Mapping[str, Any], path: Path) -> None:
             f"{path} has format {brief(meta.get('format'))} (written by metrpo {writer}), "
             f"but metrpo {metrpo_version()} reads format {FORMAT}: use metrpo {writer}, or another directory"
         )
+
+
+def inside(folder: Path, file: str) -> Path | None:
+    """The first folder up to three levels below `folder` that holds `file`; None where there is none."""
+    with contextlib.suppress(OSError):
+        for depth in range(1, 4):
+            if found := sorted(folder.glob("*/" * depth + file))[:1]:
+                return found[0].parent
+    return None
 
 
 def metrpo_version() -> str:

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from metrpo.errors import RunDirectoryError
-from metrpo.run.files import FORMAT, atomic_write, metrpo_version, read_arrays, write_arrays
+from metrpo.run.files import FORMAT, atomic_write, inside, metrpo_version, read_arrays, write_arrays
 from metrpo.untrusted import brief
 
 FILE = "policy.npz"
@@ -102,12 +102,22 @@ def load_policy(directory: str | Path) -> LoadedPolicy:
     path = Path(directory)
     path = path if path.suffix == ".npz" else path / FILE
     if not path.exists():
-        raise RunDirectoryError(
-            f"{directory} holds no policy: expected {path}; train one with: metrpo train TASK --run-dir {directory}"
-        )
+        raise RunDirectoryError(f"{directory} holds no policy: {_where_else(path)}")
     arrays, meta = read_arrays(path)
     info = _info(meta.get("policy", {}), path)
     return LoadedPolicy(info, _layers(info, arrays, path))
+
+
+def _where_else(path: Path) -> str:
+    """What to do where `path` is missing."""
+    if path.name != FILE:
+        return f"expected the file {path}, got none; give a run directory, or a policy.npz"
+    folder = path.parent
+    if run := inside(folder, FILE):
+        return f"expected one run's directory, got a folder of runs; name one of them, such as {run}"
+    if (folder / "config.json").exists():
+        return f"expected {path}, got a run whose first iteration is not finished; go on with the command that began it"
+    return f"expected {path}; train one with: metrpo train TASK --run-dir {folder}"
 
 
 def _info(stored: Any, path: Path) -> PolicyInfo:
@@ -146,9 +156,15 @@ def _layers(
     expected: dict[str, tuple[int, ...]] = {"log_std": (info.action_size,)}
     for i, (inputs, outputs) in enumerate(pairwise(sizes)):
         expected |= {f"w{i}": (inputs, outputs), f"b{i}": (outputs,)}
-    found = {name: array.shape for name, array in arrays.items()}
-    if found != expected:
-        raise RunDirectoryError(f"{path}: expected weights and biases of shapes {brief(expected)}, got {brief(found)}")
+    wrong = [f"{name} is missing" for name in expected if name not in arrays]
+    wrong += [f"got {brief(name)} besides" for name in arrays if name not in expected]
+    wrong += [
+        f"got {name} of {list(arrays[name].shape)} instead of {list(shape)}"
+        for name, shape in expected.items()
+        if name in arrays and arrays[name].shape != shape
+    ]
+    if wrong:
+        raise RunDirectoryError(f"{path}: expected weights and biases of shapes that fit its sizes; {wrong[0]}")
     for name, array in arrays.items():
         if array.dtype != np.float32:
             raise RunDirectoryError(f"{path}: {name}: expected float32, got {array.dtype}")

@@ -22,6 +22,9 @@ Row = Mapping[str, Any]
 class Progress:
     """Told by the training loop where it stands. This one shows nothing; the others override what they show."""
 
+    def resume(self, where: str, iteration: int, of: int | None, real_steps: int) -> None:
+        """A run is taken up: `iteration` of `of` comes next, after so many real steps."""
+
     def begin(self, iteration: int, of: int | None) -> None:
         """Outer iteration `iteration` (from 1) of `of` (None: unknown) begins."""
 
@@ -47,6 +50,10 @@ class PlainProgress(Progress):
     def __init__(self, out: TextIO | None = None) -> None:
         self._out = out or sys.stdout
         self._heading, self._began = "", time.monotonic()
+
+    def resume(self, where: str, iteration: int, of: int | None, real_steps: int) -> None:
+        """Prints where the run goes on."""
+        self._print(_resuming(where, iteration, of, real_steps))
 
     def begin(self, iteration: int, of: int | None) -> None:
         """Remembers the iteration; its stages name it."""
@@ -85,6 +92,11 @@ class LiveProgress(Progress):
         self._heading, self._last = "", ""
         self._task: rich_progress.TaskID | None = None
 
+    def resume(self, where: str, iteration: int, of: int | None, real_steps: int) -> None:
+        """Prints where the run goes on."""
+        text = _resuming(where, iteration, of, real_steps)
+        self._bars.console.print(text, highlight=False, markup=False, soft_wrap=True)
+
     def begin(self, iteration: int, of: int | None) -> None:
         """Starts the display with the iteration's number."""
         self._heading = _heading(iteration, of)
@@ -122,6 +134,10 @@ class Guarded(Progress):
 
     def __init__(self, shown: Progress) -> None:
         self._shown = shown
+
+    def resume(self, where: str, iteration: int, of: int | None, real_steps: int) -> None:
+        """Passed on."""
+        self._pass_on(lambda shown: shown.resume(where, iteration, of, real_steps))
 
     def begin(self, iteration: int, of: int | None) -> None:
         """Passed on."""
@@ -184,12 +200,23 @@ def summary(row: Row) -> str:
         f"{row.get('real_steps', 0):>7,} real steps",
         f"return {_number(row.get('return_real')):>7} ± {_number(row.get('return_real_std'))}",
     ]
-    if math.isnan(row.get("return_real") or 0.0):  # only another program can play
+    if _is_missing(row.get("return_real")):  # only another program can play
         parts[1] = f"collected {_number(row.get('return_collected')):>7}"
     if "return_imagined" in row:
         parts.append(f"imagined {_number(row['return_imagined']):>7}")
     seconds = sum(v for name, v in row.items() if name.startswith("seconds_") and v is not None)
     return "  ".join([*parts, duration(seconds)] if seconds else parts)
+
+
+def earned(row: Row) -> str:
+    """The real return of an iteration, or what was collected where only another program can play."""
+    if _is_missing(row.get("return_real")):
+        return f"collected {_number(row.get('return_collected'))}"
+    return f"return {_number(row.get('return_real'))}"
+
+
+def _is_missing(value: float | None) -> bool:
+    return value is None or math.isnan(value)
 
 
 def duration(seconds: float) -> str:
@@ -200,6 +227,13 @@ def duration(seconds: float) -> str:
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def _resuming(where: str, iteration: int, of: int | None, real_steps: int) -> str:
+    if of is not None and iteration > of:
+        return f"{where} is finished: {of} iterations, {real_steps:,} real steps; a larger budget goes on"
+    budget = "" if of is None else f" of {of}"
+    return f"resuming {where} at iteration {iteration}{budget}, {real_steps:,} real steps"
 
 
 def _heading(iteration: int, of: int | None) -> str:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from metrpo.experiments.statistics import mean_band
+from metrpo.experiments.statistics import common_grid, mean_band
 from metrpo.seeing.runs import Group, SeenRun
 
 POINTS = 60
@@ -31,9 +31,14 @@ class Curve(NamedTuple):
     one, itself). Empty where the seeds have no x in common."""
 
 
-def curve(group: Group, x: str, y: str) -> Curve:
-    """The column `y` of a group's runs against their column `x`; points without either are left out."""
-    seeds = [s for run in group.runs if len((s := _points(run, x, y))[0])]
+def curve(group: Group, x: str, y: str, log: bool = False, log_y: bool = False) -> Curve:
+    """The column `y` of a group's runs against their column `x`; points without either are left out.
+
+    `log` and `log_y` say which axes are logarithmic: a seed's line is straight between its points as it is drawn, so
+    that the band has to be taken from lines that are straight there. Points at or below zero have no place on such an
+    axis and are left out.
+    """
+    seeds = [s for run in group.runs if len((s := _points(run, x, y, log, log_y))[0])]
     nothing = np.empty(0)
     if not seeds:
         return Curve([], nothing, nothing, nothing, nothing)
@@ -42,8 +47,8 @@ def curve(group: Group, x: str, y: str) -> Curve:
     first, last = max(s[0][0] for s in seeds), min(s[0][-1] for s in seeds)
     if first > last:
         return Curve(seeds, nothing, nothing, nothing, nothing)
-    grid = np.linspace(first, last, POINTS) if last > first else np.array([first])
-    return Curve(seeds, grid, *mean_band(seeds, grid))
+    grid = common_grid(seeds, POINTS, log)
+    return Curve(seeds, grid, *mean_band(seeds, grid, log, log_y))
 
 
 def x_axis(runs: Sequence[SeenRun]) -> tuple[str, str]:
@@ -53,9 +58,15 @@ def x_axis(runs: Sequence[SeenRun]) -> tuple[str, str]:
     return "iteration", "iteration"
 
 
-def _points(run: SeenRun, x: str, y: str) -> tuple[np.ndarray, np.ndarray]:
+def is_far(x: str, ends: Sequence[float]) -> bool:
+    """Whether runs that end at these x are drawn on a logarithmic axis: those with and without models."""
+    return x == "real_steps" and min(ends) > 0 and max(ends) > FAR * min(ends)
+
+
+def _points(run: SeenRun, x: str, y: str, log: bool, log_y: bool) -> tuple[np.ndarray, np.ndarray]:
     xs, ys = run.column(x), run.column(y)
     there = np.isfinite(xs) & np.isfinite(ys)
+    there &= ((xs > 0) | (not log)) & ((ys > 0) | (not log_y))
     xs, ys = xs[there], ys[there]
     # A clock may stand still between two rows, and curves are read along x.
     grows = np.append(True, np.diff(np.maximum.accumulate(xs)) > 0)[: len(xs)]

@@ -14,7 +14,7 @@ import numpy as np
 from metrpo.run.metrics import is_clock
 from metrpo.seeing import svg
 from metrpo.seeing.concern import Concern
-from metrpo.seeing.curves import FAR, RATIOS, curve, x_axis
+from metrpo.seeing.curves import RATIOS, curve, is_far, x_axis
 from metrpo.seeing.figure import count, figure, swatches
 from metrpo.seeing.runs import Group, SeenRun
 from metrpo.seeing.svg import Line, bars, chart
@@ -111,13 +111,13 @@ def _learning(task: str, seen: list[Seen], groups: list[Group], colours: dict[in
     if not any(np.isfinite(s.run.column(y)).any() for s in seen):
         # only another program can play
         y, y_label, what = "return_collected", "collected return", "Return of an episode with exploration noise"
+    log = is_far(x, [s.run.column(x)[-1] for s in seen])
     for g in groups:
-        c, colour = curve(g, x, y), colours[id(g)]
+        c, colour = curve(g, x, y, log), colours[id(g)]
         if len(c.seeds) > 1:
             lines += [Line(*seed, g.label, f"{colour} thin", dots=False) for seed in c.seeds]
         lines.append(Line(c.x, c.mean, g.label, f"{colour} thick", len(c.seeds) == 1, c.low, c.high))
-    title, ends = f"Learning curves of {task}", [s.run.column(x)[-1] for s in seen]
-    log = x == "real_steps" and max(ends) > FAR * min(ends)  # runs with and without models
+    title = f"Learning curves of {task}"
     wide = chart(title, lines, x_label, y_label, size=(1120, 340), log=log)
     narrow = chart(title, lines, x_label, y_label, log=log)
     seeds = max(len(g.runs) for g in groups)
@@ -136,8 +136,7 @@ def _across(seen: list[Seen], name: str, title: str, note: str, zero: bool, x: s
     lines = [line for line in lines if np.isfinite(line.y).any()]
     if not lines:
         return ""
-    frame, ends = _robust([line.y for line in lines]) if name == "gap" else None, [line.x[-1] for line in lines]
-    log = x == "real_steps" and max(ends) > FAR * min(ends)
+    frame, log = _robust([line.y for line in lines]) if name == "gap" else None, is_far(x, [n.x[-1] for n in lines])
     log_y, mark = name.startswith(RATIOS), 1.0 if name.startswith("error_") else None
     alone = len(lines) == 1
     drawn = chart(title, lines, x_label, "", frame=frame, zero=zero, log=log, say_beyond=alone, log_y=log_y, mark=mark)

@@ -11,7 +11,7 @@ import numpy as np
 
 from metrpo.errors import ConfigError
 from metrpo.run.files import atomic_write
-from metrpo.seeing.curves import FAR, RATIOS, curve
+from metrpo.seeing.curves import RATIOS, curve, is_far
 from metrpo.seeing.runs import SeenRun, group
 
 if TYPE_CHECKING:
@@ -56,6 +56,7 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
     groups = [g for g in group(runs) if curve(g, x, y).seeds]
+    log_y = y.startswith(RATIOS) and all((seed[1] > 0).all() for g in groups for seed in curve(g, x, y).seeds)
     if not groups:
         raise ConfigError(f"y: expected a column that some run has together with {x}, got {y}; choose another --x")
     tasks = list(dict.fromkeys(g.task for g in groups))
@@ -64,8 +65,10 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
     figure = Figure(figsize=(max(5.2 * columns, 6.5), 4.2 * lines + 0.5), dpi=130, layout="constrained")
     panels = list(figure.subplots(lines, columns, squeeze=False).flat)
     for axes, task in zip(panels, tasks, strict=False):
-        for i, g in enumerate(g for g in groups if g.task == task):
-            c = curve(g, x, y)
+        of_task = [g for g in groups if g.task == task]
+        log = is_far(x, [seed[0][-1] for g in of_task for seed in curve(g, x, y).seeds])
+        for i, g in enumerate(of_task):
+            c = curve(g, x, y, log, log_y)
             style = {"color": _COLOURS[i % len(_COLOURS)], "linestyle": ("-", "--", ":")[i // len(_COLOURS) % 3]}
             if len(c.seeds) > 1:
                 for seed in c.seeds:
@@ -83,10 +86,9 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         if x == "iteration":
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        if y.startswith(RATIOS) and all((seed[1] > 0).all() for g in groups for seed in curve(g, x, y).seeds):
+        if log_y:
             _logarithmic(axes)
-        ends = [seed[0][-1] for g in groups if g.task == task for seed in curve(g, x, y).seeds]
-        if x == "real_steps" and min(ends) > 0 and max(ends) > FAR * min(ends):
+        if log:
             axes.set_xscale("log")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         legend = axes.legend(

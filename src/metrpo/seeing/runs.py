@@ -160,6 +160,19 @@ def settings(old: Config, new: Config) -> dict[str, tuple[object, object]]:
     return {name: values for name, values in difference(old, new).items() if name != "seed"}
 
 
+def told_apart(runs: Sequence[SeenRun]) -> list[dict[str, str]]:
+    """For each run the settings in which those of its task, system and preset differ, and its values of them."""
+    alike: dict[tuple[str, ...], list[Config]] = {}
+    for run in runs:
+        alike.setdefault(_kind(run.config), []).append(run.config)
+    names = {k: dict.fromkeys(n for c in of for n in settings(of[0], c)) for k, of in alike.items()}
+    return [{name: _value(run.config, name) for name in names[_kind(run.config)]} for run in runs]
+
+
+def _kind(config: Config) -> tuple[str, ...]:
+    return config.task, config.system, config.preset
+
+
 def _labels(configs: list[Config]) -> list[str]:
     """A name for each of some configs of one task: the system, and where that is not enough the settings."""
     systems = [str(c.system) for c in configs]

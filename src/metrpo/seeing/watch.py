@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,16 +19,16 @@ from rich.text import Text
 
 from metrpo.run.progress import duration
 from metrpo.seeing.health import examine
-from metrpo.seeing.runs import Found, SeenRun, find, is_finished
+from metrpo.seeing.runs import Found, SeenRun, find, is_finished, told_apart
 
 SPARKS = "▁▂▃▄▅▆▇█"
 _WIDE = 170
 """Columns of a table that does not go to a terminal."""
 _COLUMNS = (
-    "task", "system", "seed", "iteration", "real steps", "return", "best", "gap", "so far", "warnings", "s/iteration",
-    "left", "state",
+    "run", "task", "system", "preset", "seed", "changed", "iteration", "real steps", "return", "best", "gap", "so far",
+    "warnings", "s/iteration", "left", "state",
 )  # fmt: skip
-_SPARE = ("s/iteration", "best", "real steps", "gap", "left", "so far", "system")
+_SPARE = ("s/iteration", "best", "preset", "real steps", "gap", "left", "so far", "system", "changed", "seed", "run")
 """Columns that a narrow terminal goes without, first ones first."""
 _RECENT = 3
 """Iterations whose mean duration says how long the next ones take: they grow with the data."""
@@ -41,7 +41,10 @@ class Standing:
     path: str
     task: str
     system: str
+    preset: str
     seed: int
+    changed: dict[str, str]
+    """Settings in which it differs from other runs of its task, system and preset."""
     state: str
     """running, finished or stopped."""
     iteration: int
@@ -52,6 +55,9 @@ class Standing:
     return_best: float | None
     gap: float | None
     returns: list[float | None]
+    return_collected: float | None
+    """Of the last iteration's episodes, with exploration noise."""
+    returns_collected: list[float | None]
     warnings: int
     notes: int
     seconds_per_iteration: float | None
@@ -60,10 +66,10 @@ class Standing:
     """Since something was written."""
 
 
-def standing(run: SeenRun, now: float | None = None) -> Standing:
-    """Where a run stands; `now` is the time of day in seconds."""
+def standing(run: SeenRun, now: float | None = None, changed: Mapping[str, str] | None = None) -> Standing:
+    """Where a run stands; `now` is the time of day in seconds, `changed` what tells it from others (`told_apart`)."""
     config, rows = run.config, run.rows
-    real, concerns = run.column("return_real"), examine(rows, config)
+    real, collected, concerns = run.column("return_real"), run.column("return_collected"), examine(rows, config)
     seconds = _seconds(run)
     total, iteration = _total(run), int(rows[-1]["iteration"] or 0) if rows else 0
     state = "finished" if is_finished(run) else "running" if is_running(run.path) else "stopped"
@@ -74,7 +80,9 @@ def standing(run: SeenRun, now: float | None = None) -> Standing:
         path=str(run.path),
         task=config.task,
         system=config.system,
+        preset=config.preset,
         seed=config.seed,
+        changed=dict(changed or {}),
         state=state,
         iteration=iteration,
         iterations=total,
@@ -83,6 +91,8 @@ def standing(run: SeenRun, now: float | None = None) -> Standing:
         return_best=float(finite.max()) if len(finite) else None,
         gap=_plain(run.column("gap")[-1]) if rows else None,
         returns=[_plain(value) for value in real],
+        return_collected=_plain(collected[-1]) if rows else None,
+        returns_collected=[_plain(value) for value in collected],
         warnings=sum(c.level == "warning" for c in concerns),
         notes=sum(c.level == "note" for c in concerns),
         seconds_per_iteration=seconds,
@@ -136,16 +146,21 @@ def sparkline(values: Sequence[float | None], width: int = 12) -> str:
     return "".join(SPARKS[round((v - low) / way * top) if way else 0] if math.isfinite(v) else " " for v in shown)
 
 
+def standings_of(runs: Sequence[SeenRun]) -> list[Standing]:
+    """Where each of some runs stands, and what tells it from the others."""
+    return [standing(run, changed=changed) for run, changed in zip(runs, told_apart(runs), strict=True)]
+
+
 def table(found: Found, console: Console) -> Group:
     """One line a run, running ones first, and below it what could not be read; columns as far as there is room."""
     order = ("running", "stopped", "finished")
-    standings = sorted((standing(run) for run in found.runs), key=lambda s: order.index(s.state))
-    columns = list(_COLUMNS)
+    standings = sorted(standings_of(found.runs), key=lambda s: order.index(s.state))
+    columns = [name for name in _COLUMNS if name != "changed" or any(s.changed for s in standings)]
     grid = _grid(columns, standings)
     for spare in _SPARE:
         if Measurement.get(console, console.options.update(max_width=9999), grid).maximum <= console.width:
             break
-        columns.remove(spare)
+        columns = [name for name in columns if name != spare]
         grid = _grid(columns, standings)
     below = [Text(f"cannot be read: {skipped.why}", style="yellow", overflow="fold") for skipped in found.skipped]
     return Group(grid, *below)
@@ -154,10 +169,11 @@ def table(found: Found, console: Console) -> Group:
 def _grid(columns: Sequence[str], standings: Sequence[Standing]) -> Table:
     grid = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, collapse_padding=True)
     for name in columns:
-        left = name in ("task", "system", "so far", "state")
+        left = name in ("run", "task", "system", "preset", "changed", "so far", "state")
         grid.add_column(name, justify="left" if left else "right", no_wrap=name != "task", overflow="fold")
+    names = _names([s.path for s in standings])
     for s in standings:
-        cells = _cells(s)
+        cells = _cells(s) | {"run": (names[s.path], "")}
         # What a run directory says must not be read as markup.
         grid.add_row(*(Text(*cells[name]) for name in columns))
     return grid
@@ -186,20 +202,35 @@ def watch(paths: Sequence[Path], every: float, once: bool, console: Console | No
             live.update(table(find(paths), console), refresh=True)
 
 
+def _names(paths: Sequence[str]) -> dict[str, str]:
+    """The paths without the folders that all share."""
+    if len(paths) == 1:
+        return {paths[0]: Path(paths[0]).name or paths[0]}
+    try:
+        shared = os.path.commonpath(paths)
+    except ValueError:  # some are absolute and others are not
+        return {path: path for path in paths}
+    return {path: os.path.relpath(path, shared) if shared else path for path in paths}
+
+
 def _cells(s: Standing) -> dict[str, tuple[str, str]]:
     """Text and style by column."""
     colour = {"running": "green", "stopped": "red", "finished": "dim"}[s.state]
+    # Only another program can play: a robot's, say.
+    is_robots = all(r is None for r in s.returns) and s.return_collected is not None
     since = f" {duration(s.seconds_since)} ago" if s.state == "stopped" and s.seconds_since is not None else ""
     return {
         "task": (s.task, ""),
         "system": (s.system, ""),
+        "preset": (s.preset, ""),
         "seed": (str(s.seed), ""),
+        "changed": (", ".join(f"{name}={value}" for name, value in s.changed.items()), ""),
         "iteration": (f"{s.iteration}/{'?' if s.iterations is None else s.iterations}", ""),
         "real steps": (f"{s.real_steps:,}", ""),
-        "return": (_number(s.return_real), "bold"),
+        "return": (f"{_number(s.return_collected)} collected" if is_robots else _number(s.return_real), "bold"),
         "best": (_number(s.return_best), ""),
         "gap": (_number(s.gap), ""),
-        "so far": (sparkline(s.returns), "cyan"),
+        "so far": (sparkline(s.returns_collected if is_robots else s.returns), "cyan"),
         "warnings": (str(s.warnings) if s.warnings else "-", "bold red" if s.warnings else ""),
         "s/iteration": ("-" if s.seconds_per_iteration is None else f"{s.seconds_per_iteration:.1f}", ""),
         "left": ("-" if s.seconds_left is None else duration(s.seconds_left), ""),
