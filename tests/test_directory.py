@@ -12,12 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from metrpo import training
 from metrpo.config import Config, TRPOConfig, to_json
 from metrpo.errors import RunDirectoryError
 from metrpo.run import directory as module
 from metrpo.run.directory import RunDirectory
 from metrpo.run.metrics import read_metrics
 from metrpo.run.policy_file import load_policy
+from metrpo.run.progress import Progress
 
 CONFIG = Config("Swimmer", iterations=5)
 DETERMINISTIC = dataclasses.replace(CONFIG, deterministic=True)
@@ -283,6 +285,28 @@ def test_a_run_with_anything_to_lose_keeps_its_claim(tmp_path, kept):
     (tmp_path / kept).write_text("")
     with pytest.raises(RunDirectoryError, match="other settings"):
         train(tmp_path, dataclasses.replace(CONFIG, seed=CONFIG.seed + 1))
+
+
+class Heard(Progress):
+    def __init__(self) -> None:
+        self.heard: list[tuple] = []
+
+    def resume(self, where: str, iteration: int, of: int | None, real_steps: int) -> None:
+        self.heard.append((where, iteration, of, real_steps))
+
+
+@pytest.mark.parametrize(
+    ("budget", "expected"), [({"iterations": 5}, 5), ({"real_steps": 5 * a_state(1).real_steps}, 5), ({}, 2)]
+)
+def test_training_says_where_a_run_is_taken_up(tmp_path, monkeypatch, budget, expected):
+    monkeypatch.setattr(training, "init", lambda config: a_state())
+    monkeypatch.setattr(training, "step", lambda _, s, *rest: (a_state(s.iteration + 1), a_row(s.iteration + 1)))
+    config = dataclasses.replace(CONFIG, iterations=2, real_steps=None)
+    first, again = Heard(), Heard()
+    training.train(config, tmp_path, first)
+    training.train(dataclasses.replace(config, **budget), tmp_path, again)
+    assert first.heard == [], "nothing to resume"
+    assert again.heard == [(str(tmp_path), 3, expected, a_state(2).real_steps)]
 
 
 def test_the_budget_may_change(tmp_path):

@@ -3,6 +3,7 @@
 import csv
 import json
 import runpy
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -28,6 +29,24 @@ def test_the_table_script_takes_every_committed_run():
         (row,) = [line for line in table.splitlines() if line.startswith(f"| laptop | Swimmer | {system} |")]
         assert row.split(" | ")[7] == "-", "no gap"
     assert "nan" not in table
+
+
+def test_make_train_takes_a_directory_with_a_space(tmp_path):
+    (tmp_path / "metrpo").write_text('#!/bin/sh\nprintf "%s|" "$@"\n')
+    (tmp_path / "metrpo").chmod(0o755)
+    (tmp_path / "ready").touch()
+    make = ["make", "-s", "train", f"BIN={tmp_path}", f"READY={tmp_path}/ready"]
+    for run_dir, expected in (("", ""), ("runs/my 'own' run", "--run-dir|runs/my 'own' run|")):
+        ran = subprocess.run([*make, f"RUN_DIR={run_dir}"], cwd=ROOT, capture_output=True, text=True, check=True)
+        assert ran.stdout == f"train|Swimmer|{expected}"
+
+
+def test_what_the_readme_writes_is_ignored_by_git():
+    written = ["report.html", "curves.png", "swim.py", "swim.gif", "swim.onnx", "runs/a/config.json"]
+    ran = subprocess.run(["git", "check-ignore", *written], cwd=ROOT, capture_output=True, text=True)
+    if ran.returncode == 128:
+        pytest.skip("not a git checkout")
+    assert ran.stdout.split() == written
 
 
 def test_there_are_results():
