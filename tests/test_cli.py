@@ -65,7 +65,7 @@ def _stubs(monkeypatch, tmp_path):
     stub = types.ModuleType("metrpo.training")
     stub.train = train  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "metrpo.training", stub)
-    monkeypatch.setattr(directory, "draw_curve", lambda rows, path, title: None)
+    monkeypatch.setattr(directory, "draw_curve", lambda rows, path, title, *_: None)
     monkeypatch.setattr("metrpo.evaluation.record", lambda make_env, policy, path, seed: path)
     monkeypatch.chdir(tmp_path)
     handler = signal.getsignal(signal.SIGTERM)

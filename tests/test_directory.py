@@ -86,14 +86,14 @@ def stable(path: Path) -> dict[str, bytes]:
 @pytest.fixture(autouse=True)
 def _no_pictures(monkeypatch):
     # The learning curve costs a second each; test_report draws it.
-    monkeypatch.setattr(module, "draw_curve", lambda rows, path, title: None)
+    monkeypatch.setattr(module, "draw_curve", lambda rows, path, title, *_: None)
 
 
 def test_the_rows_are_published_last(tmp_path, monkeypatch):
     """By them a run counts as finished and is not begun again: killed before, it must not look so."""
     seen = []
 
-    def look(rows, path, title):
+    def look(rows, path, title, yardsticks):
         metrics = path.with_name("metrics.csv")
         published = len(read_metrics(metrics)) if metrics.exists() else 0
         seen.append((len(rows), published, load_policy(path.parent).info.iteration))
@@ -173,7 +173,7 @@ sys.path.insert(0, sys.argv[1])
 import tensorboardX  # once, not in every child
 import test_directory as t
 from metrpo.run import directory
-directory.draw_curve = lambda rows, path, title: None
+directory.draw_curve = lambda rows, path, title, *_: None
 calls, real = 0, {name: getattr(os, name) for name in ("replace", "fsync", "unlink")}
 def deadly(name):
     def call(*arguments, **named):

@@ -126,6 +126,20 @@ def test_each_warning_says_what_and_since_when(code, rows, config, since, said):
     assert set(found) - {code} <= {"no-improvement", "few-evaluation-episodes"}, "one cause, one warning"
 
 
+def test_a_policy_that_earns_less_than_nothing_does_is_told():
+    idle = {"doing nothing": 120.0, "random actions": -3.0}
+    found = {c.code: c for c in examine(healthy(), CONFIG, idle)}
+    assert found["no-skill"].since == 1
+    assert found["no-skill"].level == "warning"
+    assert "where doing nothing earns 120" in found["no-skill"].measured
+    assert [c.level for c in examine(healthy(3), CONFIG, idle) if c.code == "no-skill"] == ["note"], "it has time"
+    assert "no-skill" not in [
+        c.code for c in examine(healthy(), CONFIG, {"doing nothing": 5.0, "random actions": -3.0})
+    ]
+    other = {"no-improvement", "few-evaluation-episodes", "no-skill", "model-exploited"}
+    assert set(found) <= other
+
+
 def test_every_check_has_a_case():
     fired = {check.__name__ for check in CHECKS for _, rows, config, *_ in CASES if check(rows, config)}
     assert fired == {check.__name__ for check in CHECKS}

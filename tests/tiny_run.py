@@ -99,7 +99,7 @@ def cheap():
         patch.setattr(EpisodeLog, "append", counted_append)
         patch.setattr(claim, "source_commit", lambda: "a commit")
         patch.setattr(machine, "prepare", lambda *_, **__: None)
-        patch.setattr(directory, "draw_curve", lambda rows, path, title: atomic_write(path, f"{len(rows)} rows"))
+        patch.setattr(directory, "draw_curve", lambda rows, path, title, *_: atomic_write(path, f"{len(rows)} rows"))
         yield
 
 

@@ -6,6 +6,7 @@ functions, init(config) -> state and step(config, state, progress) -> (state, ro
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Mapping
@@ -17,14 +18,18 @@ import numpy as np
 
 from metrpo.algorithm import Log, Row
 from metrpo.config import Config
-from metrpo.errors import ConfigError
+from metrpo.errors import ConfigError, MetrpoError
 from metrpo.finite import require_finite
 from metrpo.run.directory import RunDirectory, Saved
 from metrpo.run.progress import SILENT, Progress
+from metrpo.run.yardsticks import keep
 from metrpo.seeds import Stage, rng_of
 from metrpo.world.check import check_formulas
 from metrpo.world.known import KNOWN
 from metrpo.world.registry import get_task
+from metrpo.world.yardsticks import measure
+
+_log = logging.getLogger("metrpo")
 
 METHODS = {
     "model-based": "metrpo.algorithm",
@@ -75,6 +80,7 @@ def train(config: Config, run_dir: str | Path | None = None, progress: Progress 
         state = run.load(template)
         if state is None:
             check(config)
+            _measure_yardsticks(config, run, progress)
         elif state.iteration or state.real_steps:
             left = _iterations_left(config, state)
             of = None if left is None else state.iteration + max(left, 0)
@@ -91,6 +97,20 @@ def check(config: Config) -> None:
     ours = task.make is None or task.name in KNOWN  # which the tests hold against their environments
     if not (ours or config.trust_reward or config.learn_reward):
         check_formulas(task, rng_of(config.seed, 0, Stage.COLLECT))
+
+
+def _measure_yardsticks(config: Config, run: RunDirectory, progress: Progress) -> None:
+    """Keeps in run.json, and says, what no skill earns: real steps that nobody counts and nothing is learned from."""
+    task = get_task(config.task)
+    if not task.playable or config.real_steps == 0:
+        return
+    try:
+        found = measure(task)
+    except MetrpoError as error:  # a record may not cost the run
+        _log.warning("what doing nothing and random actions earn could not be measured: %s", error)
+        return
+    keep(run.path, found.record())
+    progress.say(found.text())
 
 
 def _loop(

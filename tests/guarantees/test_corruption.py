@@ -57,7 +57,7 @@ class Real(NamedTuple):
 def _quick():
     """The probe is a task, pictures are quick to draw, and nothing waits for the disk."""
     with probe.registered(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(directories, "draw_curve", lambda rows, path, _: path.write_text(f"{len(rows)} iterations"))
+        patch.setattr(directories, "draw_curve", lambda rows, path, *_: path.write_text(f"{len(rows)} iterations"))
         patch.setattr(os, "fsync", lambda _: None)
         yield
 

@@ -55,7 +55,7 @@ TINY = override(
 @pytest.fixture(scope="module", autouse=True)
 def _probe_is_a_task():
     with probe.registered(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(directory, "draw_curve", lambda rows, path, title: path.write_text(f"{len(rows)} rows"))
+        patch.setattr(directory, "draw_curve", lambda rows, path, title, *_: path.write_text(f"{len(rows)} rows"))
         yield
 
 

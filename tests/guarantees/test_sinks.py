@@ -85,7 +85,9 @@ def test_what_breaks_costs_only_itself(owner, name, what, costs, breaks, tmp_pat
 
 
 def test_what_takes_long_but_ends_is_waited_for(tmp_path, monkeypatch):
-    monkeypatch.setattr(directory, "draw_curve", lambda rows, path, title: (time.sleep(0.3), path.write_text("done")))
+    monkeypatch.setattr(
+        directory, "draw_curve", lambda rows, path, title, *_: (time.sleep(0.3), path.write_text("done"))
+    )
     train(CONFIG, tmp_path)
     assert (tmp_path / "curve.png").read_text() == "done"
 
@@ -93,9 +95,9 @@ def test_what_takes_long_but_ends_is_waited_for(tmp_path, monkeypatch):
 def test_tensorboards_directory_may_go_at_any_time(tmp_path, expected, monkeypatch, caplog):
     draw = directory.draw_curve
 
-    def sweeping(rows, path, title):
+    def sweeping(rows, path, title, yardsticks):
         shutil.rmtree(tmp_path / "events", ignore_errors=True)
-        draw(rows, path, title)
+        draw(rows, path, title, yardsticks)
 
     monkeypatch.setattr(directory, "draw_curve", sweeping)
     train(CONFIG, tmp_path)

@@ -29,6 +29,7 @@ import numpy as np
 from metrpo import config as configs
 from metrpo.config import Config
 from metrpo.errors import ConfigError, RunDirectoryError
+from metrpo.run import yardsticks
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.claim import claim, require_same
 from metrpo.run.episodes import EpisodeLog
@@ -225,7 +226,8 @@ class RunDirectory:
         if not self.rows:
             return
         title = f"{self.config.task}, {self.config.system}, {self.config.preset}, seed {self.config.seed}"
-        self._derive("learning curve", lambda: draw_curve(self.rows, self.path / "curve.png", title))
+        lines = yardsticks.kept(self.path)
+        self._derive("learning curve", lambda: draw_curve(self.rows, self.path / "curve.png", title, lines))
         self._derive("TensorBoard events", self._write_events)
         if all(rows := [details(row) for row in self.rows]):
             atomic_write(self.path / "diagnostics.csv", to_csv(rows))

@@ -22,8 +22,12 @@ Row = Mapping[str, Any]
 class Progress:
     """Told by the training loop where it stands. This one shows nothing; the others override what they show."""
 
+    def say(self, text: str) -> None:
+        """Something about the run that is worth a line."""
+
     def resume(self, where: str, iteration: int, of: int | None, real_steps: int) -> None:
         """A run is taken up: `iteration` of `of` comes next, after so many real steps."""
+        self.say(_resuming(where, iteration, of, real_steps))
 
     def begin(self, iteration: int, of: int | None) -> None:
         """Outer iteration `iteration` (from 1) of `of` (None: unknown) begins."""
@@ -51,9 +55,9 @@ class PlainProgress(Progress):
         self._out = out or sys.stdout
         self._heading, self._began = "", time.monotonic()
 
-    def resume(self, where: str, iteration: int, of: int | None, real_steps: int) -> None:
-        """Prints where the run goes on."""
-        self._print(_resuming(where, iteration, of, real_steps))
+    def say(self, text: str) -> None:
+        """Prints it."""
+        self._print(text)
 
     def begin(self, iteration: int, of: int | None) -> None:
         """Remembers the iteration; its stages name it."""
@@ -92,9 +96,8 @@ class LiveProgress(Progress):
         self._heading, self._last = "", ""
         self._task: rich_progress.TaskID | None = None
 
-    def resume(self, where: str, iteration: int, of: int | None, real_steps: int) -> None:
-        """Prints where the run goes on."""
-        text = _resuming(where, iteration, of, real_steps)
+    def say(self, text: str) -> None:
+        """Prints it."""
         self._bars.console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def begin(self, iteration: int, of: int | None) -> None:
@@ -135,9 +138,9 @@ class Guarded(Progress):
     def __init__(self, shown: Progress) -> None:
         self._shown = shown
 
-    def resume(self, where: str, iteration: int, of: int | None, real_steps: int) -> None:
+    def say(self, text: str) -> None:
         """Passed on."""
-        self._pass_on(lambda shown: shown.resume(where, iteration, of, real_steps))
+        self._pass_on(lambda shown: shown.say(text))
 
     def begin(self, iteration: int, of: int | None) -> None:
         """Passed on."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,13 +16,15 @@ from metrpo.run.metrics import Row
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+NOTHING: Mapping[str, float] = MappingProxyType({})
 _REAL, _IMAGINED, _COLLECTED, _SHARE = "#1f5fa8", "#d9772b", "#8a8f98", "#3f8f5f"
 
 
-def draw_curve(rows: Sequence[Row], path: Path, title: str) -> None:
+def draw_curve(rows: Sequence[Row], path: Path, title: str, yardsticks: Mapping[str, float] = NOTHING) -> None:
     """Draws returns against real steps, and below them how far the models are off: PNG, 1350 x 1050 pixels, atomic.
 
-    Columns that a row lacks are left out of the picture. Raises `RunDirectoryError` when it cannot be written.
+    `yardsticks` are returns by name, such as that of doing nothing: level lines. Columns that a row lacks are left out
+    of the picture. Raises `RunDirectoryError` when it cannot be written.
     """
     from matplotlib.figure import (
         Figure,
@@ -34,7 +37,7 @@ def draw_curve(rows: Sequence[Row], path: Path, title: str) -> None:
         _draw_gap(below, steps, rows)
     else:  # a method without models
         above = below = figure.subplots()
-    _draw_returns(above, steps, rows)
+    _draw_returns(above, steps, rows, yardsticks)
     figure.suptitle(title, fontsize=14, fontweight="bold", parse_math=False)  # a task's name is no formula
     best = _column(rows, "return_real")
     if np.isfinite(best).any():
@@ -52,7 +55,7 @@ def draw_curve(rows: Sequence[Row], path: Path, title: str) -> None:
     atomic_write(path, picture.getvalue())
 
 
-def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
+def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row], yardsticks: Mapping[str, float]) -> None:
     real, std, collected, imagined = (
         _column(rows, name) for name in ("return_real", "return_real_std", "return_collected", "return_imagined")
     )
@@ -73,8 +76,11 @@ def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
         axes.plot(steps, imagined, "s-", color=_IMAGINED, linewidth=1.3, markersize=4, label="imagined (models)")
     if played:
         axes.plot(steps, real, "o-", color=_REAL, linewidth=2.2, markersize=5, label="real (deterministic policy)")
+    for (name, level), style in zip(yardsticks.items(), ("--", ":"), strict=False):
+        axes.axhline(level, color="#333333", linewidth=1.1, linestyle=style, label=f"{name} ({level:.4g})")
     axes.set_ylabel("return of an episode")
-    axes.set_ylim(_frame(np.concatenate([real - std, real + std, collected]), imagined))
+    levels = np.array(list(yardsticks.values()))
+    axes.set_ylim(_frame(np.concatenate([real - std, real + std, collected, levels]), imagined))
     axes.legend(loc="best", frameon=False, fontsize=9)
 
 

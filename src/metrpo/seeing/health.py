@@ -6,7 +6,8 @@ the runs under results/ each one fires.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -35,10 +36,16 @@ CHECKS: tuple[Callable[[Sequence[Row], Config], Concern | None], ...] = (
 """Extend them by adding a row."""
 
 
-def examine(rows: Sequence[Row], config: Config) -> list[Concern]:
-    """What there is to say about a run that has these rows, warnings first; nothing where it is healthy."""
+def examine(
+    rows: Sequence[Row], config: Config, yardsticks: Mapping[str, float] = MappingProxyType({})
+) -> list[Concern]:
+    """What there is to say about a run that has these rows, warnings first; nothing where it is healthy.
+
+    `yardsticks` are the returns of ways to act that have learned nothing, by name.
+    """
     if not rows:
         return []
     with np.errstate(all="ignore"):  # what is not finite has a sign of its own
-        found = [concern for check in CHECKS if (concern := check(rows, config)) is not None]
+        signs = [*(check(rows, config) for check in CHECKS), policy_signs.no_skill(rows, config, yardsticks)]
+    found = [sign for sign in signs if sign is not None]
     return sorted(found, key=lambda concern: concern.level != "warning")

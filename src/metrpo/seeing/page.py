@@ -85,7 +85,7 @@ def _seen(groups: list[Group]) -> list[Seen]:
             full = f"{name} ({run.path.name})" if names.count(name) > 1 else name
             dashed = " dashed" * (place // svg.COLOURS % 2)
             colour = f"c{place % svg.COLOURS}{dashed}"
-            found.append(Seen(run, g, full, colour, examine(run.rows, run.config)))
+            found.append(Seen(run, g, full, colour, examine(run.rows, run.config, run.yardsticks)))
     return found
 
 

@@ -117,6 +117,8 @@ def _learning(task: str, seen: list[Seen], groups: list[Group], colours: dict[in
         if len(c.seeds) > 1:
             lines += [Line(*seed, g.label, f"{colour} thin", dots=False) for seed in c.seeds]
         lines.append(Line(c.x, c.mean, g.label, f"{colour} thick", len(c.seeds) == 1, c.low, c.high))
+    levels = _yardsticks(seen)
+    lines += [Line(_ends(lines), np.full(2, level), name, "level dashed", False) for name, level in levels.items()]
     title = f"Learning curves of {task}"
     wide = chart(title, lines, x_label, y_label, size=(1120, 340), log=log)
     narrow = chart(title, lines, x_label, y_label, log=log)
@@ -124,10 +126,23 @@ def _learning(task: str, seen: list[Seen], groups: list[Group], colours: dict[in
     said = {1: "", 2: " Thin: seeds; thick: their mean; band: their range."}.get(
         seeds, " Thin: seeds; thick: their mean; band: its 95 % bootstrap interval (of two seeds, their range)."
     )
+    said += "".join(f" Dashed: {name} earns {svg.number(level)}." for name, level in levels.items())
     return (
         f"{_legend(groups, colours)}<figure class=wide>{wide}</figure><figure class=narrow>{narrow}</figure>"
         f'<p class="small">{what} against {x_label}.{said}</p>'
     )
+
+
+def _yardsticks(seen: list[Seen]) -> dict[str, float]:
+    """What no skill earns on the task, by name: the mean over the runs that have measured it."""
+    found = [s.run.yardsticks for s in seen if s.run.yardsticks]
+    return {name: float(np.mean([one[name] for one in found])) for name in (found[0] if found else {})}
+
+
+def _ends(lines: list[Line]) -> np.ndarray:
+    """First and last x of some lines."""
+    x = np.concatenate([line.x for line in lines])
+    return np.array([x.min(), x.max()]) if len(x) else np.empty(0)
 
 
 def _across(seen: list[Seen], name: str, title: str, note: str, zero: bool, x: str, x_label: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -21,6 +21,8 @@ REJECTED = 0.5
 """Share of the updates that moved nothing."""
 SATURATED = 0.5
 """Share of the mean actions beyond the limits."""
+SOON = 5
+"""Iterations in which a policy need not be better than none."""
 NEVER_ACCEPTED, NEVER_STOPPED, FLAT = 3, 8, 5
 """Iterations without an accepted update; up to max_updates; before a first gain is missed."""
 LAST, FEW = 10, 5
@@ -68,6 +70,25 @@ def no_improvement(rows: Sequence[Row], config: Config) -> Concern | None:
         "the task was solved at once, or nothing is learnt",
         "look at the video; if it fails, more exploration (collect.max_std), more real steps an iteration "
         "(collect.steps), or a reward that says more",
+    )
+
+
+def no_skill(rows: Sequence[Row], config: Config, yardsticks: Mapping[str, float]) -> Concern | None:
+    """The policy earns no more than one that has learned nothing."""
+    real = column(rows, "return_real")
+    if not yardsticks or not np.isfinite(real[-1]):
+        return None
+    name, best = max(yardsticks.items(), key=lambda item: item[1])
+    since = since_when(rows, real <= best)
+    if since is None:
+        return None
+    return Concern(
+        "no-skill",
+        "note" if len(rows) < SOON else "warning",
+        since,
+        f"Return {short(real[-1])}, where {name} earns {short(best)}",
+        "the policy is worth less than none",
+        "look at its video and at the gap; more real steps, another seed, or a reward that says more",
     )
 
 

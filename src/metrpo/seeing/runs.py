@@ -14,6 +14,7 @@ import numpy as np
 
 from metrpo.config import Config, difference, from_json
 from metrpo.errors import ConfigError, RunDirectoryError
+from metrpo.run import yardsticks
 from metrpo.run.metrics import Row, read_metrics
 
 _INSIDE = {"checkpoints", "episodes", "events", ".git", ".venv", "node_modules", "__pycache__"}
@@ -30,6 +31,8 @@ class SeenRun:
     """Its finished iterations; none while it is in its first."""
     details: list[Row] = field(default_factory=list)
     """Of diagnostics.csv, each with its iteration; none of a run from before it was written."""
+    yardsticks: dict[str, float] = field(default_factory=dict)
+    """What no skill earns, by name; empty where that was not measured."""
 
     def column(self, name: str) -> np.ndarray:
         """One number an iteration, of metrics.csv or else of diagnostics.csv; NaN where there is none."""
@@ -98,7 +101,7 @@ def read(folder: Path) -> SeenRun:
         rows = []  # in its first iteration
     except (OSError, ValueError, TypeError, csv.Error) as error:
         raise RunDirectoryError(f"{metrics} cannot be read: {error}; put it back or leave the run out") from None
-    return SeenRun(folder, config, rows)
+    return SeenRun(folder, config, rows, yardsticks=yardsticks.kept(folder))
 
 
 def _details(file: Path) -> list[Row]:

@@ -51,7 +51,7 @@ polyline.thick{stroke-width:2.4}polyline.thin{stroke-width:1;opacity:.45}polylin
 circle,.fill{fill:currentColor}
 .band{fill:currentColor;opacity:.14}
 .c0,.real{color:var(--c0)}.c1,.imagined{color:var(--c1)}.c2{color:var(--c2)}.c3{color:var(--c3)}.c4{color:var(--c4)}
-.c5{color:var(--c5)}
+.c5{color:var(--c5)}.level{color:var(--soft)}
 a{color:var(--c0)}
 @media(max-width:640px){main{padding:.8rem}.wide{display:none}.narrow{display:block}h1{font-size:1.4rem}
 th,td{padding:.35rem .5rem}

@@ -69,7 +69,11 @@ class Standing:
 def standing(run: SeenRun, now: float | None = None, changed: Mapping[str, str] | None = None) -> Standing:
     """Where a run stands; `now` is the time of day in seconds, `changed` what tells it from others (`told_apart`)."""
     config, rows = run.config, run.rows
-    real, collected, concerns = run.column("return_real"), run.column("return_collected"), examine(rows, config)
+    real, collected, concerns = (
+        run.column("return_real"),
+        run.column("return_collected"),
+        examine(rows, config, run.yardsticks),
+    )
     seconds = _seconds(run)
     total, iteration = _total(run), int(rows[-1]["iteration"] or 0) if rows else 0
     state = "finished" if is_finished(run) else "running" if is_running(run.path) else "stopped"
