@@ -186,6 +186,8 @@ WRONG = [
     (["frobnicate"], "frobnicate"),
     (["evaluate", "nowhere"], "nowhere holds no policy"),
     (["render", "nowhere"], "nowhere holds no policy"),
+    (["render", "nowhere", "--seed", "-1"], "seed: expected at least 0, got -1"),
+    (["evaluate", "nowhere", "--seed", "-1"], "seed: expected at least 0, got -1"),
     (["evaluate"], "DIR"),
 ]
 

@@ -1,14 +1,23 @@
 """Videos: frames of a real episode in a file that players open, or a message that says what to install."""
 
+import dataclasses
+import os
+import re
 import subprocess
 import sys
+import types
 
+import gymnasium
 import numpy as np
 import pytest
 from PIL import Image
 
+from helpers import random_policy
 from metrpo.run import video
+from metrpo.run.metrics import to_csv
+from metrpo.run.policy_file import save_policy
 from metrpo.run.video import VideoError, gl_backend, has_encoder, record
+from metrpo.world.registry import get_task
 
 needs_encoder = pytest.mark.skipif(not has_encoder(), reason="no video encoder (extra `video`)")
 
@@ -72,22 +81,96 @@ def test_no_encoder_says_what_to_install(tmp_path, monkeypatch):
         record(Pictures, zero, tmp_path / "v.mp4")
 
 
-def test_no_gl_says_what_to_install(tmp_path, monkeypatch):
-    def broken(self):
-        raise RuntimeError("no display")
-
-    monkeypatch.setattr(Pictures, "render", broken)
+def test_what_an_opengl_library_raises_is_opengl_that_is_missing(tmp_path, monkeypatch):
+    library = types.ModuleType("OpenGL.fake")
+    exec("def draw():\n    raise RuntimeError('no display')", library.__dict__)
+    monkeypatch.setattr(Pictures, "render", lambda self: library.draw())
     with pytest.raises(VideoError, match=r"cannot render here \(RuntimeError: no display\): apt install libosmesa6"):
         record(Pictures, zero, tmp_path / "v.gif")
     assert not any(tmp_path.iterdir())
 
 
+def test_other_failures_are_not_blamed_on_opengl(tmp_path, monkeypatch):
+    def broken(self):
+        raise RuntimeError("no paint")
+
+    monkeypatch.setattr(Pictures, "render", broken)
+    with pytest.raises(VideoError, match=r"render\(\) failed \(RuntimeError: no paint\): mend") as error:
+        record(Pictures, zero, tmp_path / "v.gif")
+    assert "osmesa" not in str(error.value)
+    monkeypatch.setattr(Pictures, "render", gymnasium.Env.render)
+    with pytest.raises(VideoError, match=r"has no render\(\): there is nothing to see; do without: --no-video"):
+        record(Pictures, zero, tmp_path / "v.gif")
+
+
+@pytest.mark.parametrize("name", ["Pendulum-v1", "MountainCarContinuous-v0"])
+def test_without_pygame_that_is_what_is_missing(name, tmp_path, monkeypatch):
+    for module in [m for m in sys.modules if m.split(".")[0] == "pygame"]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    task = get_task(name)
+    with pytest.raises(VideoError, match=r"a package is missing .*pygame.*: pip install 'metrpo\[video\]'") as error:
+        record(task.make_env, lambda _: np.zeros(1, np.float32), tmp_path / "v.gif")
+    assert "osmesa" not in str(error.value)
+
+
+def test_with_pygame_the_pendulum_is_seen(tmp_path):
+    pytest.importorskip("pygame")
+    task = dataclasses.replace(get_task("Pendulum-v1"), make=lambda **kw: gymnasium.make("Pendulum-v1", 5, **kw))
+    with Image.open(record(task.make_env, lambda _: np.zeros(1, np.float32), tmp_path / "v.gif")) as picture:
+        assert picture.n_frames == 6
+
+
 def test_an_environment_without_pictures_is_named(tmp_path, monkeypatch):
-    with pytest.raises(VideoError, match=r"cannot be made with render_mode.*TypeError.*--no-video"):
+    with pytest.raises(VideoError, match=r"cannot be made with render_mode.*TypeError.*take render_mode.*--no-video"):
         record(lambda: None, zero, tmp_path / "v.gif")
     monkeypatch.setattr(Pictures, "render", lambda self: None)
-    with pytest.raises(VideoError, match=r"expected a picture \[height, width, 3\], got NoneType"):
+    with pytest.raises(VideoError, match=r"expected a picture \[height, width, 3\], got NoneType.*--no-video"):
         record(Pictures, zero, tmp_path / "v.gif")
+
+
+NO_LIBRARY = """
+import ctypes, ctypes.util, sys
+load, find = ctypes.CDLL.__init__, ctypes.util.find_library
+def absent(name):
+    return any(library in str(name) for library in ("OSMesa", "EGL"))
+def cannot_load(self, name, *rest, **more):
+    if absent(name):
+        raise OSError(f"{name}: cannot open shared object file")
+    load(self, name, *rest, **more)
+ctypes.CDLL.__init__ = cannot_load
+ctypes.util.find_library = lambda name: None if absent(name) else find(name)
+from metrpo.cli import main
+for command in (["tasks"], ["doctor"], ["render", sys.argv[1], "--out", "v.gif"]):
+    print("exit code", main(command), flush=True)
+from metrpo import cli
+cli._report(cli.Path(sys.argv[1]), video=True)  # what a finished run says
+"""
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ("osmesa", r"no OpenGL to render with \(tried osmesa: .*\): apt install libosmesa6"),
+        ("egl", r"no OpenGL to render with \(tried egl: .*\): apt install libosmesa6"),
+        ("nonsense", "MUJOCO_GL: expected osmesa, egl or glfw, got nonsense"),
+        ("off", "MUJOCO_GL=off switches rendering off: unset it"),
+    ],
+)
+def test_an_opengl_that_is_not_there_costs_the_video_only(asked, said, tmp_path):
+    policy = random_policy(0, 10, 2)
+    save_policy(tmp_path, policy, "Swimmer", 1, 200, 1.5)
+    row = {"iteration": 1, "real_steps": 200, "return_real": 1.5, "return_real_std": 0.5}
+    (tmp_path / "metrics.csv").write_text(to_csv([row]))
+    environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": asked}
+    command = [sys.executable, "-W", "ignore", "-c", NO_LIBRARY, str(tmp_path)]
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert ran.returncode == 0, ran.stderr
+    assert re.findall("exit code ([0-9])", ran.stdout) == ["0", "0", "2"]
+    assert "training can work here" in ran.stdout
+    assert re.search(f"^metrpo: {said}", ran.stderr, re.MULTILINE)
+    assert ran.stderr.count("\n") == 1
+    assert re.search(f"video    none: {said}", ran.stdout)
 
 
 def test_other_suffixes_are_refused(tmp_path):

@@ -64,8 +64,7 @@ def evaluate(
     """
     if episodes < 1:
         raise ConfigError(f"episodes: expected at least 1, got {episodes}")
-    if seed < 0:
-        raise ConfigError(f"seed: expected at least 0, got {seed}")
+    _require_seed(seed)
     act = load_policy(policy) if isinstance(policy, str | Path) else policy
     name = task or (act.info.task if isinstance(act, LoadedPolicy) else None)
     if name is None:
@@ -78,7 +77,13 @@ def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0) ->
     """Records one real episode of a run's policy, by default to `video.mp4` in the run directory; returns the file.
 
     Raises `RunDirectoryError` when the directory holds no sound policy, `VideoError` when this machine cannot render,
-    encode or write it.
+    encode or write it, `ConfigError` for a seed below 0.
     """
+    _require_seed(seed)
     policy = load_policy(run_dir)
     return record(get_task(policy.info.task).make_env, policy, Path(out or Path(run_dir) / "video.mp4"), seed)
+
+
+def _require_seed(seed: int) -> None:
+    if seed < 0:
+        raise ConfigError(f"seed: expected at least 0, got {seed}")

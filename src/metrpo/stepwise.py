@@ -17,12 +17,14 @@ from metrpo import algorithm
 from metrpo.algorithm import State
 from metrpo.config import Config
 from metrpo.errors import ConfigError, RunDirectoryError
+from metrpo.memory import require_memory
 from metrpo.run.directory import RunDirectory, stored_config
 from metrpo.run.metrics import Row
 from metrpo.run.progress import SILENT, Progress
 from metrpo.training import check
 from metrpo.types import Episode
 from metrpo.world import logged
+from metrpo.world.registry import get_task
 
 
 def begin(config: Config, run_dir: str | Path) -> None:
@@ -97,6 +99,7 @@ def _content(episode: Episode) -> tuple[bytes | bool, ...]:
 def _ours(config: Config) -> State:
     if config.method != "model-based":
         raise ConfigError(f"system: expected one that learns models, got {config.system}; it runs by metrpo train only")
+    require_memory(config, get_task(config.task))
     return algorithm.init(config)
 
 

@@ -20,6 +20,7 @@ from metrpo.algorithm import Log, Row
 from metrpo.config import Config
 from metrpo.errors import ConfigError, MetrpoError
 from metrpo.finite import require_finite
+from metrpo.memory import require_memory
 from metrpo.run.directory import RunDirectory, Saved
 from metrpo.run.progress import SILENT, Progress
 from metrpo.run.yardsticks import keep
@@ -44,10 +45,12 @@ METHODS = {
 def init(config: Config) -> Saved:
     """The state before the first iteration of the config's method.
 
-    Raises `TaskError` for an unknown task or unfitting data, `ConfigError` for settings that contradict each other.
+    Raises `TaskError` for an unknown task or unfitting data, `ConfigError` for settings that contradict each other or
+    ask for more memory than there is.
     """
     if config.method != "model-based" and (config.data is not None or config.real_steps == 0):
         raise ConfigError(f"data: only the method model-based learns from logged transitions, got {config.method}")
+    require_memory(config, get_task(config.task))
     state: Saved = import_module(METHODS[config.method]).init(config)
     return state
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import importlib
+import os
 import platform
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
 
 from metrpo.errors import MetrpoError
+from metrpo.gl import INSTALL_GL, load_mujoco
 from metrpo.run import video
 from metrpo.run.files import metrpo_version
 from metrpo.run.machine import INSTALL_GPU, cores, device_names, has_nvidia
@@ -47,15 +50,18 @@ def diagnose() -> Diagnosis:
     found = Diagnosis(versions | {n: _version(n) for n in NEEDED}, cores(), [], video.gl_backend(), video.has_encoder())
     for name in NEEDED:
         try:
-            importlib.import_module(name)
+            load_mujoco() if name == "mujoco" else importlib.import_module(name)
         except Exception as error:  # a broken package fails in its own way
             found.problems.append(f"{name} does not import ({error}): pip install --force-reinstall {name}")
     if not found.problems:
         _look_for_devices(found)
     if found.gl is None:
-        found.hints.append(f"no OpenGL, so no videos: {video.INSTALL_GL}")
+        asked = f" that MUJOCO_GL={os.environ['MUJOCO_GL']} names" if os.environ.get("MUJOCO_GL") else ""
+        found.hints.append(f"no OpenGL{asked}, so no videos: {INSTALL_GL}")
     if not found.encoder:
-        found.hints.append(f"no video encoder, .gif only: {video.INSTALL_ENCODER}")
+        found.hints.append(f"no video encoder, .gif only: {video.INSTALL_EXTRA}")
+    if find_spec("pygame") is None:
+        found.hints.append(f"no pygame, so no videos of Pendulum-v1 and its like: {video.INSTALL_EXTRA}")
     return found
 
 

@@ -6,18 +6,22 @@ import contextlib
 import os
 import subprocess
 import sys
+import traceback
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from metrpo.errors import MetrpoError
+from metrpo.gl import INSTALL_GL
 from metrpo.run.files import temporary_path
 
-INSTALL_ENCODER = "pip install 'metrpo[video]'"
-INSTALL_GL = "apt install libosmesa6 (software) or libegl1 (GPU), then set MUJOCO_GL=osmesa or MUJOCO_GL=egl"
+INSTALL_EXTRA = "pip install 'metrpo[video]'"
+_GL = ("mujoco", "OpenGL", "glfw", "pyglet")
+"""Packages that draw by OpenGL."""
 
 
 class VideoError(MetrpoError):
@@ -35,7 +39,7 @@ def record(make_env: Callable[..., Any], policy: Callable[[np.ndarray], np.ndarr
     if path.suffix not in writers:
         raise VideoError(f"{path}: expected a file name that ends in .mp4 or .gif")
     if path.suffix == ".mp4" and not has_encoder():
-        raise VideoError(f"no video encoder: {INSTALL_ENCODER}, or choose a .gif")
+        raise VideoError(f"no video encoder: {INSTALL_EXTRA}, or choose a .gif")
     frames, fps = _episode(make_env, policy, seed)
     temporary = temporary_path(path)
     try:
@@ -89,13 +93,13 @@ def _renders(backend: str) -> bool:
 def _episode(
     make_env: Callable[..., Any], policy: Callable[[np.ndarray], np.ndarray], seed: int
 ) -> tuple[list[Any], int]:
+    # pygame would greet, and look for loudspeakers, among what the command says.
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
     try:
         env = make_env(render_mode="rgb_array")
     except Exception as error:  # whatever somebody's constructor raises
-        raise VideoError(
-            f'the environment cannot be made with render_mode="rgb_array" ({type(error).__name__}: {error}): '
-            "let its constructor take render_mode, or do without: --no-video"
-        ) from error
+        raise _blame(error, 'the environment cannot be made with render_mode="rgb_array"') from error
     try:
         observation, _ = env.reset(seed=seed)
         frames, over = [_frame(env)], False
@@ -111,16 +115,39 @@ def _episode(
 def _frame(env: Any) -> np.ndarray:
     try:
         picture = env.render()
-    except MetrpoError as error:
-        raise VideoError(str(error)) from error
     except Exception as error:  # every GL library fails in its own way
-        raise VideoError(
-            f"cannot render here ({type(error).__name__}: {error}): {INSTALL_GL}; see: metrpo doctor"
-        ) from error
+        raise _blame(error, "render() failed") from error
     if np.ndim(picture) != 3:
-        raise VideoError(f"render: expected a picture [height, width, 3], got {type(picture).__name__}")
+        raise VideoError(
+            f"render: expected a picture [height, width, 3], got {type(picture).__name__}: let the environment return "
+            'one where render_mode is "rgb_array", or do without: --no-video'
+        )
     height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2  # what yuv420p can hold
     return np.ascontiguousarray(picture[:height, :width])
+
+
+def _blame(error: Exception, what: str) -> VideoError:
+    """Says what is missing: OpenGL, a package, or a part of the environment."""
+    causes = [cause for cause in (error.__cause__, error) if cause is not None]
+    cause = causes[0] if isinstance(error, MetrpoError) else error
+    said = f"{type(cause).__name__}: {cause}"
+    if isinstance(error, MetrpoError) and (cause is error or INSTALL_GL in str(error)):
+        return VideoError(str(error))
+    if any(map(_comes_from_gl, causes)):
+        return VideoError(f"cannot render here ({said}): {INSTALL_GL}; see: metrpo doctor")
+    if isinstance(cause, gymnasium.error.DependencyNotInstalled | ImportError):
+        install = INSTALL_EXTRA if "pygame" in str(cause) else "install what it names"
+        return VideoError(f"{what}: a package is missing ({said}): {install}, or do without: --no-video")
+    if isinstance(cause, NotImplementedError):
+        return VideoError("the environment has no render(): there is nothing to see; do without: --no-video")
+    advice = "let its constructor take render_mode" if isinstance(cause, TypeError) else "mend the environment"
+    return VideoError(f"{what} ({said}): {advice}, or do without: --no-video")
+
+
+def _comes_from_gl(error: BaseException) -> bool:
+    """Whether an OpenGL library, or what calls it, was at work when the error was raised."""
+    modules = [str(frame.f_globals.get("__name__")) for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return any(name.split(".")[0] in _GL or "mujoco_rendering" in name for name in modules)
 
 
 def _write_mp4(path: Path, frames: list[np.ndarray], fps: int) -> None:

@@ -8,11 +8,8 @@ MuJoCo's generalised positions and velocities. Units are MuJoCo's: metres, secon
 from __future__ import annotations
 
 import importlib
-import os
-import sys
 import warnings
 from collections.abc import Callable, Mapping
-from ctypes.util import find_library
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from typing import Any
@@ -23,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from metrpo.errors import TaskError
+from metrpo.gl import INSTALL_GL, gl_library
 from metrpo.types import Array
 from metrpo.world.registry import get_task, register
 from metrpo.world.task import Task
@@ -273,7 +271,10 @@ class _Painter:
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        name = _gl_library()
+        try:
+            name = gl_library()
+        except ValueError as error:
+            raise TaskError(str(error)) from None
         try:
             source = importlib.import_module(f"mujoco.{name}") if name else mujoco
             self._gl = source.GLContext(_FRAME_SIZE, _FRAME_SIZE)
@@ -281,8 +282,7 @@ class _Painter:
             self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except Exception as error:  # each GL library fails in its own way
             raise TaskError(
-                f"no OpenGL to render with (tried {name or 'the default of mujoco'}: {error}): install libosmesa6 and "
-                "set MUJOCO_GL=osmesa, or install libegl1 and set MUJOCO_GL=egl"
+                f"no OpenGL to render with (tried {name or 'the default of mujoco'}: {error}): {INSTALL_GL}"
             ) from error
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         self._scene = mujoco.MjvScene(model, maxgeom=1000)
@@ -307,18 +307,6 @@ class _Painter:
         self._gl.make_current()
         self._context.free()
         self._gl.free()
-
-
-def _gl_library() -> str | None:
-    """The module of mujoco that holds the GL context to use, None for its default.
-
-    OSMesa goes first because it needs neither a display nor a GPU; libEGL may be there without a device to open.
-    """
-    # PyOpenGL serves one library per process, and another environment may have chosen already.
-    chosen = os.environ.get("MUJOCO_GL") or os.environ.get("PYOPENGL_PLATFORM")
-    if chosen or sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
-        return chosen if chosen in ("egl", "osmesa") else None
-    return "osmesa" if find_library("OSMesa") else "egl" if find_library("EGL") else None
 
 
 class MujocoTask(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):

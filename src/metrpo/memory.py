@@ -1,0 +1,70 @@
+"""Whether a run's arrays fit into this machine, asked before the first of them is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+from metrpo.config import Config
+from metrpo.errors import ConfigError
+from metrpo.run import machine
+from metrpo.world.task import Task
+
+_FLOAT = 4
+"""Bytes of a number."""
+_COPIES = 4
+"""Of every weight while it learns: itself, the best so far, and Adam's two moments."""
+
+
+@dataclass(frozen=True)
+class Need:
+    """The least memory that a setting asks for."""
+
+    setting: str
+    """Its name, "imagine.steps"."""
+    value: object
+    what: str
+    """Whose memory it is."""
+    size: int
+    """Bytes."""
+
+
+def require_memory(config: Config, task: Task) -> None:
+    """Raises `ConfigError`, naming the setting and the size, when what the run must hold exceeds the memory."""
+    there = machine.memory()
+    for need in _needs(config, task):
+        if need.size > there:
+            raise ConfigError(
+                f"{need.setting}: expected what fits into the {_gib(there)} of memory here, got {need.value}, for "
+                f"which {need.what} alone take {_gib(need.size)}; choose less"
+            )
+
+
+def _needs(config: Config, task: Task) -> list[Need]:
+    s, a, e = task.state_size, task.action_size, config.ensemble
+    network = _weights((s + a, *e.hidden, s + len(task.learned))) * _FLOAT * _COPIES
+    policy = _weights((s, *config.policy.hidden, a)) * _FLOAT * _COPIES
+    value = _weights((s, *config.advantage.value_hidden, 1)) * _FLOAT * _COPIES
+    needs = [Need("policy.hidden", config.policy.hidden, "the policy's weights", policy)]
+    if config.method == "model-based":
+        batch = e.members * config.fit.batch_size * (2 * s + a) * _FLOAT
+        imagined = config.imagine.steps * (2 * s + a) * _FLOAT
+        starts = e.members * config.validate.starts * s * _FLOAT
+        needs += [
+            Need("ensemble.hidden", e.hidden, "one model's weights and their optimizer", network),
+            Need("ensemble.members", e.members, "the models' weights and their optimizer", e.members * network),
+            Need("imagine.steps", config.imagine.steps, "imagined transitions", imagined),
+            Need("fit.batch_size", config.fit.batch_size, "the batches of a training step", batch),
+            Need("validate.starts", config.validate.starts, "the states from which models validate", starts),
+        ]
+        if config.advantage.baseline == "network":
+            needs.append(Need("advantage.value_hidden", config.advantage.value_hidden, "the value network", value))
+    return needs
+
+
+def _weights(sizes: tuple[int, ...]) -> int:
+    return sum((inputs + 1) * outputs for inputs, outputs in pairwise(sizes))
+
+
+def _gib(size: int) -> str:
+    return f"{size / 2**30:,.1f} GiB"
