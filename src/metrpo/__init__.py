@@ -14,6 +14,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from metrpo.config import Config
+from metrpo.environment_ids import register_ids_with_gymnasium
 from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError, TaskError
 
 if TYPE_CHECKING:
@@ -65,6 +66,8 @@ _HOME = {
     "metrpo.world.registry": ("get_task", "tasks"),
     "metrpo.world.task": ("Task",),
 }
+
+register_ids_with_gymnasium()
 
 
 def __getattr__(name: str) -> Any:

@@ -93,9 +93,10 @@ def _renders(backend: str) -> bool:
 def _episode(
     make_env: Callable[..., Any], policy: Callable[[np.ndarray], np.ndarray], seed: int
 ) -> tuple[list[Any], int]:
-    # pygame would greet, and look for loudspeakers, among what the command says.
+    # pygame would greet, and complain of a screen that is not there, among what the command says.
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-    os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     try:
         env = make_env(render_mode="rgb_array")
     except Exception as error:  # whatever somebody's constructor raises

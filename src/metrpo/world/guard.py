@@ -59,6 +59,7 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float64], dict[str, Any]]:
         """A new episode: state [S] and the environment's info."""
+        super().reset(seed=seed)
         result = self._call("reset", lambda: self._env.reset(seed=seed, options=options))
         if not (isinstance(result, tuple) and len(result) == 2):
             raise self._broken("reset()", "(observation, info)", result, "return both, as Gymnasium does since 0.26")

@@ -19,6 +19,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from metrpo.environment_ids import HORIZONS, env_id, register_ids
 from metrpo.errors import TaskError
 from metrpo.gl import INSTALL_GL, gl_library
 from metrpo.types import Array
@@ -212,33 +213,25 @@ def _add(
     robot: _Robot,
     name: str,
     sizes: tuple[int, int],
-    horizon: int,
     reward: _Reward,
     unseen: tuple[int, ...],
     description: str,
     terminated: Callable[[Array], Array] | None = None,
 ) -> None:
-    """Makes a task known to metrpo and, as `metrpo/<name>-v0`, to Gymnasium."""
+    """Makes a task known to metrpo; Gymnasium knows it by `metrpo.environment_ids`, with its time limit."""
     _ROBOTS[name] = robot
-    env_id = f"metrpo/{name}-v0"
-    register(Task(name, env_id, *sizes, horizon, reward, terminated, unseen, description))
-    gymnasium.register(
-        env_id,
-        entry_point="metrpo.world.mujoco:MujocoTask",
-        max_episode_steps=horizon,
-        disable_env_checker=True,  # it costs every step of every run what the tests check once
-        kwargs={"task": name},
-    )
+    register(Task(name, env_id(name), *sizes, HORIZONS[name], reward, terminated, unseen, description))
 
 
-_add(_SWIMMER, "Swimmer", (10, 2), 200, _velocity_reward(5, 0.005), (0, 1), "3 links swim along x in a viscous fluid")
-_add(_SNAKE, "Snake", (14, 4), 200, _velocity_reward(7, 0.005), (0, 1), "5 links swim along x in a viscous fluid")
-_add(_HOPPER, "Hopper", (11, 3), 100, hopper_reward, (), "one leg hops along x without sinking below 0.45 m")
-_add(_HOPPER, "HopperUpright", (11, 3), 100, hopper_upright_reward, (), "Hopper that must also stay upright")
-_add(_CHEETAH, "HalfCheetah", (18, 6), 100, _velocity_reward(9, 0.05), (0,), "two legs in a plane run along x")
-_add(_ANT, "Ant", (29, 8), 100, _velocity_reward(15, 0.005, 0.05), (0, 1), "four legs walk along x", ant_terminated)
-_add(_HUMANOID, "Humanoid", (47, 17), 100, humanoid_reward, (), "keep the head at 1.5 m, starting upright")
-_add(_LYING, "HumanoidStandup", (47, 17), 100, humanoid_reward, (), "bring the head to 1.5 m, starting on the floor")
+register_ids()
+_add(_SWIMMER, "Swimmer", (10, 2), _velocity_reward(5, 0.005), (0, 1), "3 links swim along x in a viscous fluid")
+_add(_SNAKE, "Snake", (14, 4), _velocity_reward(7, 0.005), (0, 1), "5 links swim along x in a viscous fluid")
+_add(_HOPPER, "Hopper", (11, 3), hopper_reward, (), "one leg hops along x without sinking below 0.45 m")
+_add(_HOPPER, "HopperUpright", (11, 3), hopper_upright_reward, (), "Hopper that must also stay upright")
+_add(_CHEETAH, "HalfCheetah", (18, 6), _velocity_reward(9, 0.05), (0,), "two legs in a plane run along x")
+_add(_ANT, "Ant", (29, 8), _velocity_reward(15, 0.005, 0.05), (0, 1), "four legs walk along x", ant_terminated)
+_add(_HUMANOID, "Humanoid", (47, 17), humanoid_reward, (), "keep the head at 1.5 m, starting upright")
+_add(_LYING, "HumanoidStandup", (47, 17), humanoid_reward, (), "bring the head to 1.5 m, starting on the floor")
 
 
 # ---------------------------------------------------------------- the environment
