@@ -1,0 +1,81 @@
+"""Policy phases in fixed models: `python benchmarks/phases.py RUN_DIR [--phases 5] [--seeds 3] VARIANT...`.
+
+A variant is a list of settings, such as `policy.mean_penalty=0.2,advantage.gae_lambda=1`, or `as-run`. The models and
+data of a run's newest checkpoint stay as they are; the policy goes on from the checkpoint, phase after phase. A setting
+of the policy phase is so tried in minutes, without collecting and fitting. Printed for every variant, seed and phase:
+updates made and accepted, what the models promise, what is earned, std and the share of saturated mean actions; and the
+mean over the seeds of the last phases. `--fresh`: the policy begins untrained instead.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from functools import partial
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from metrpo import algorithm, config, phase
+from metrpo.config import Config
+from metrpo.model import ensemble as ensembles
+from metrpo.model.diagnostics import diagnose
+from metrpo.model.ensemble import Ensemble
+from metrpo.policy.improve import init_baseline
+from metrpo.presets import override
+from metrpo.run.clock import Clock
+from metrpo.run.directory import RunDirectory
+from metrpo.run.progress import SILENT
+from metrpo.seeds import Stage, key_of
+
+
+def main() -> None:
+    """Prints one line for each phase."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run_dir", type=Path)
+    parser.add_argument("variants", nargs="+")
+    parser.add_argument("--phases", type=int, default=5)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--fresh", action="store_true")
+    arguments = parser.parse_args()
+    settings = config.from_json((arguments.run_dir / "config.json").read_text())
+    with RunDirectory(arguments.run_dir, settings) as run:
+        state = run.load(algorithm.init(settings))
+    if state is None:
+        parser.error(f"{arguments.run_dir}: expected a run with a checkpoint, got none")
+    for variant in arguments.variants:
+        values = {} if variant == "as-run" else dict(pair.split("=") for pair in variant.split(","))
+        now = override(settings, {name: json.loads(value) for name, value in values.items()})
+        play = partial(phases, now, state, arguments.phases, arguments.fresh, variant)
+        last = [play(seed) for seed in range(10, 10 + arguments.seeds)]
+        print(f"{variant}: last phases earn {np.mean(last):.1f} (worst {np.min(last):.1f})", flush=True)
+
+
+def phases(config: Config, state: algorithm.State, count: int, fresh: bool, variant: str, seed: int) -> float:
+    """Plays `count` phases and returns what the last policy earns."""
+    config = override(config, {"seed": seed})
+    task, e, data = algorithm.task_for(config), config.ensemble, state.dataset
+    normaliser = ensembles.normaliser_of(data.train, e.std_floor, e.delta_std_floor, task.unseen)
+    ensemble = Ensemble(state.networks, normaliser)
+    first = algorithm.init(config).policy if fresh else state.policy
+    baseline = init_baseline(config, task.state_size, key_of(seed, 0, Stage.IMPROVE))
+    state = state._replace(policy=first, baseline=baseline)
+    earned = np.nan
+    for number in range(1, count + 1):
+        policy, baseline, info = algorithm._improve(config, task, state, data, ensemble, number, SILENT, Clock())
+        state = state._replace(policy=policy, baseline=baseline)
+        earned = float(np.mean(algorithm.evaluate(config, task, policy, number)))
+        horizon, key = phase.imagined_horizon(config, task), jax.random.key(seed)
+        saturated = diagnose(ensemble, policy, data.validation, data.train, horizon, key).saturated
+        std = float(np.mean(np.exp(np.asarray(policy.log_std))))
+        print(
+            f"{variant}  seed {seed}  phase {number}: {info.accepted_updates} of {info.updates} updates accepted, "
+            f"imagined {np.mean(info.values):.1f}, real {earned:.1f}, std {std:.2f}, saturated {saturated:.0%}",
+            flush=True,
+        )
+    return earned
+
+
+if __name__ == "__main__":
+    main()
