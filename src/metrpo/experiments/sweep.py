@@ -50,7 +50,9 @@ class Grid:
         if len(budget) > 1:
             raise ConfigError("sweep: expected iterations or real_steps, got both; leave one out")
         if twice := [name for name in names if budget and name in BUDGET_FIELDS]:
-            raise ConfigError(f"set: expected each budget once, got {twice[0]} besides {budget[0][0]}; leave one out")
+            raise ConfigError(
+                f"set: {twice[0]}: expected the budget in one place, got it as an option too; leave one out"
+            )
         if unknown := [s for s in self.systems if s not in get_args(System)]:
             raise ConfigError(f"sweep: systems: expected some of {', '.join(get_args(System))}, got {unknown[0]}")
         found = []
