@@ -212,7 +212,7 @@ def test_an_unwritable_directory_is_one_message(capsys, tmp_path):
 @pytest.mark.parametrize(
     ("damage", "arguments", "message"),
     [
-        (lambda p: None, ["--trpo.max-kl", "0.02"], "trpo.max_kl  directory has 0.03, asked for 0.02"),
+        (lambda p: None, ["--trpo.max-kl", "0.02"], "trpo.max_kl  directory has 0.01, asked for 0.02"),
         (lambda p: None, ["--preset", "paper"], "asked for paper"),
         (
             lambda p: (p / "run.json").write_text('{"format": 9, "metrpo": "7.0"}'),
