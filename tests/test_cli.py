@@ -415,7 +415,7 @@ def test_a_gpu_multiplies_in_float32_unless_told_otherwise(monkeypatch, tmp_path
     for name in ("JAX_PLATFORMS", "XLA_FLAGS", "NPROC", "JAX_COMPILATION_CACHE_DIR", "JAX_DEFAULT_MATMUL_PRECISION"):
         monkeypatch.setenv(name, "")  # put back at the end
         monkeypatch.delenv(name)
-    monkeypatch.setattr(machine, "_require_gpu", lambda: None)
+    monkeypatch.setattr(machine, "_require_device", lambda device: None)
     machine.prepare("cpu", deterministic=False)
     assert "JAX_DEFAULT_MATMUL_PRECISION" not in os.environ
     machine.prepare("gpu", deterministic=False)
