@@ -20,11 +20,11 @@ from metrpo.model.imagine import SAMPLINGS, imagine, outcome, returns_per_model
 from metrpo.presets import override, preset
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
-from metrpo.world import registry
+from metrpo.world import registry, resolve
 from metrpo.world.check import check_formulas
 from metrpo.world.guard import Guarded
 from metrpo.world.registry import get_task
-from metrpo.world.resolve import resolve, task_of
+from metrpo.world.resolve import task_of
 
 
 class Env(gymnasium.Env):
@@ -135,7 +135,7 @@ def test_a_task_or_an_environment_out_of_a_file(file):
 def test_a_task_out_of_a_module(file, monkeypatch):
     monkeypatch.syspath_prepend(file.rpartition("/")[0])
     assert get_task("mine:task").horizon == 50
-    resolve.cache_clear()
+    resolve._resolve.cache_clear()
 
 
 @pytest.mark.parametrize(

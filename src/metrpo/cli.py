@@ -155,7 +155,7 @@ def _collect(command: Collect) -> int:
     from metrpo.stepwise import collect
 
     with _attended(command.dir, SILENT if command.json else default_progress()) as progress:
-        waiting = collect(command.dir, command.steps, command.data, progress)
+        waiting = collect(command.dir, command.steps, command.data, progress, command.task)
     found: dict[str, float] = {"episodes": len(waiting), "steps": sum(len(e.rewards) for e in waiting)}
     found |= {"return": sum(float(e.rewards.sum()) for e in waiting) / max(len(waiting), 1)}
     text = "{episodes} episodes of {steps:,} steps wait, mean return {return:.1f}"
@@ -173,7 +173,7 @@ def _improve(command: Improve) -> int:
     from metrpo.stepwise import improve
 
     with _attended(command.dir, SILENT if command.json else default_progress()) as progress:
-        row = improve(command.dir, progress)
+        row = improve(command.dir, progress, command.task)
     print(_json(row) if command.json else f"  policy   {command.dir / FILE}")
     return 0
 
@@ -201,7 +201,7 @@ def _report(run_dir: Path, video: bool) -> None:
 def _evaluate(command: Evaluate) -> int:
     from metrpo.evaluation import evaluate
 
-    result = evaluate(command.dir, episodes=command.episodes, seed=command.seed).summary()
+    result = evaluate(command.dir, command.task, command.episodes, command.seed).summary()
     text = "{task}: return {mean:.2f} ± {std:.2f} (min {min:.2f}, max {max:.2f}) over {episodes} episodes, seed {seed}"
     print(json.dumps(result) if command.json else text.format(**result))
     return 0
@@ -210,7 +210,7 @@ def _evaluate(command: Evaluate) -> int:
 def _render(command: Render) -> int:
     from metrpo.evaluation import render
 
-    print(render(command.dir, command.out, command.seed))
+    print(render(command.dir, command.out, command.seed, command.task))
     return 0
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from metrpo.errors import ConfigError
 from metrpo.run.policy_file import LoadedPolicy, load_policy
+from metrpo.run.task_file import task_of_run
 from metrpo.run.video import record
 from metrpo.world import collect
 from metrpo.world.registry import get_task
@@ -57,7 +58,8 @@ def evaluate(
 ) -> EvaluationResult:
     """Plays whole real episodes with a policy: a run directory, what `load_policy` gives, or any function [S] -> [A].
 
-    `task` is needed for a plain function only. The same seed gives the same start states.
+    `task` is needed for a plain function, and where the file of a run's task has moved. The same seed gives the same
+    start states.
 
     Raises `RunDirectoryError` when the directory holds no sound policy, `TaskError` for an unknown task, `ConfigError`
     for fewer than one episode or a function without a task.
@@ -66,22 +68,27 @@ def evaluate(
         raise ConfigError(f"episodes: expected at least 1, got {episodes}")
     _require_seed(seed)
     act = load_policy(policy) if isinstance(policy, str | Path) else policy
-    name = task or (act.info.task if isinstance(act, LoadedPolicy) else None)
-    if name is None:
+    if isinstance(policy, str | Path) and isinstance(act, LoadedPolicy):
+        known = task_of_run(policy, act.info.task, task)
+    elif name := task or (act.info.task if isinstance(act, LoadedPolicy) else None):
+        known = get_task(name)
+    else:
         raise ConfigError("task: expected the task that this function is to be evaluated on, got none")
-    known = get_task(name)
     return EvaluationResult(known.name, seed, collect.evaluate(known, act, episodes, seed))
 
 
-def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0) -> Path:
+def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0, task: str | None = None) -> Path:
     """Records one real episode of a run's policy, by default to `video.mp4` in the run directory; returns the file.
+
+    `task` says where the run's task is, if its file has moved.
 
     Raises `RunDirectoryError` when the directory holds no sound policy, `VideoError` when this machine cannot render,
     encode or write it, `ConfigError` for a seed below 0.
     """
     _require_seed(seed)
     policy = load_policy(run_dir)
-    return record(get_task(policy.info.task).make_env, policy, Path(out or Path(run_dir) / "video.mp4"), seed)
+    known = task_of_run(run_dir, policy.info.task, task)
+    return record(known.make_env, policy, Path(out or Path(run_dir) / "video.mp4"), seed)
 
 
 def _require_seed(seed: int) -> None:

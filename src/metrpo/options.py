@@ -98,6 +98,8 @@ class Collect:
     """Play until the episodes that wait have so many steps; default: the run's collect.steps."""
     data: Annotated[str | None, arg(metavar="FILE")] = None
     """Instead: minari:NAME, or an .npz of logged states, actions, rewards, next_states, terminated."""
+    task: Annotated[str | None, arg(metavar="TASK")] = None
+    """Where the run's task is, if its file has moved."""
     json: bool = False
     """Print JSON."""
 
@@ -116,6 +118,8 @@ class Improve:
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """The run directory."""
+    task: Annotated[str | None, arg(metavar="TASK")] = None
+    """Where the run's task is, if its file has moved."""
     json: bool = False
     """Print the iteration's metrics as JSON."""
 
@@ -135,6 +139,8 @@ class Evaluate:
     """How many."""
     seed: int = 0
     """Decides the start states."""
+    task: Annotated[str | None, arg(metavar="TASK")] = None
+    """Where the run's task is, if its file has moved."""
     json: bool = False
     """Print JSON."""
 
@@ -154,6 +160,8 @@ class Render:
     """File to write, .mp4 or .gif; default: video.mp4 in the run directory."""
     seed: int = 0
     """Decides the start state."""
+    task: Annotated[str | None, arg(metavar="TASK")] = None
+    """Where the run's task is, if its file has moved."""
 
 
 @dataclass(frozen=True)

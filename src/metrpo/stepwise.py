@@ -18,6 +18,7 @@ from metrpo.algorithm import State
 from metrpo.config import Config
 from metrpo.errors import ConfigError, RunDirectoryError
 from metrpo.memory import require_memory
+from metrpo.run import task_file
 from metrpo.run.directory import RunDirectory, stored_config
 from metrpo.run.metrics import Row
 from metrpo.run.progress import SILENT, Progress
@@ -37,20 +38,27 @@ def begin(config: Config, run_dir: str | Path) -> None:
         if run.load(state) is not None:
             raise RunDirectoryError(f"{run_dir} holds a run already: go on with metrpo improve, or choose another")
         check(config)
+        task_file.remember(run_dir, config.task)
         run.begin(state)
 
 
 def collect(
-    run_dir: str | Path, at_least: int | None = None, data: str | Path | None = None, progress: Progress = SILENT
+    run_dir: str | Path,
+    at_least: int | None = None,
+    data: str | Path | None = None,
+    progress: Progress = SILENT,
+    task: str | None = None,
 ) -> list[Episode]:
     """Adds real episodes to those that wait, and returns all that do.
 
     Plays the environment with exploration until the waiting episodes have `at_least` steps (default: the config's
-    `collect.steps`), or reads a log (see `world.logged`) and adds what does not wait yet.
+    `collect.steps`), or reads a log (see `world.logged`) and adds what does not wait yet. `task` says where the run's
+    task is, if its file has moved.
 
     Raises `RunDirectoryError` when `run_dir` holds no run.
     """
     config = stored_config(run_dir)
+    task_file.task_of_run(run_dir, config.task, task)
     with RunDirectory(run_dir, config) as run:
         state = _state(run, config)
         if data is not None:
@@ -69,12 +77,14 @@ def collect(
             progress.close()
 
 
-def improve(run_dir: str | Path, progress: Progress = SILENT) -> Row:
+def improve(run_dir: str | Path, progress: Progress = SILENT, task: str | None = None) -> Row:
     """Learns from the episodes that wait, one outer iteration, and returns its row of metrics.
 
-    Raises `RunDirectoryError` when `run_dir` holds no run, or no episodes wait.
+    `task` says where the run's task is, if its file has moved. Raises `RunDirectoryError` when `run_dir` holds no run,
+    or no episodes wait.
     """
     config = stored_config(run_dir)
+    task_file.task_of_run(run_dir, config.task, task)
     with RunDirectory(run_dir, config) as run:
         state = _state(run, config)
         episodes = run.episodes.pending()

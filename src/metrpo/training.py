@@ -21,6 +21,7 @@ from metrpo.config import Config
 from metrpo.errors import ConfigError, MetrpoError
 from metrpo.finite import require_finite
 from metrpo.memory import require_memory
+from metrpo.run import task_file
 from metrpo.run.directory import RunDirectory, Saved
 from metrpo.run.progress import SILENT, Progress
 from metrpo.run.yardsticks import keep
@@ -80,6 +81,7 @@ def train(config: Config, run_dir: str | Path | None = None, progress: Progress 
         check(config)
         return _loop(config, template, progress, lambda state, row: row)
     with RunDirectory(run_dir, config) as run:
+        task_file.remember(run_dir, config.task)
         state = run.load(template)
         if state is None:
             check(config)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import importlib
 import importlib.util
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
@@ -70,24 +72,48 @@ def _make(env: str | MakeEnv, name: str, horizon: int | None, **kwargs: Any) -> 
     return Guarded(made, name, horizon)
 
 
-@cache
+_PLACES: dict[str, str] = {}
+"""What a name stands for in this process, where that is not what it says."""
+
+
+def place(name: str, where: str) -> None:
+    """From here on `name` stands for the task `where`: its file lies elsewhere than when a run was named by it."""
+    _PLACES[name] = where
+
+
+def file_of(name: str) -> Path | None:
+    """The file, absolute, of the task file.py:name; None for any other name."""
+    module, colon, _ = name.rpartition(":")
+    return Path(module).resolve() if colon and module.endswith(".py") else None
+
+
 def resolve(name: str) -> Task | None:
-    """The task that `name` stands for: an id, or `module:name` or `file.py:name` of a task or of an environment.
+    """The task that `name` stands for: an id, or `module:name` or `file.py:name` of a task, of what makes an
+    environment, or of an id that the module registers.
 
     None when it is neither; the same object every time. Raises `TaskError` when it is one and cannot be used.
     """
-    if name.startswith("dm_control/"):
+    where = _PLACES.get(name, name)
+    file = file_of(where)
+    return _resolve(name, where if file is None else f"{file}:{where.rpartition(':')[2]}")
+
+
+@cache
+def _resolve(name: str, where: str) -> Task | None:
+    if where.startswith("dm_control/"):
         _register_dm_control()
-        if name in gymnasium.registry:
-            return task_of(name, horizon=_DM_CONTROL_STEPS)
-    if name in gymnasium.registry:
-        return task_of(name)
-    module, colon, attribute = name.rpartition(":")
+        if where in gymnasium.registry:
+            return task_of(where, name=name, horizon=_DM_CONTROL_STEPS)
+    if where in gymnasium.registry:
+        return task_of(where, name=name)
+    module, colon, attribute = where.rpartition(":")
     if not colon:
         return None
     value = getattr(_import(module, name), attribute, None)
+    if value is None and attribute in gymnasium.registry:
+        return task_of(attribute, name=name)
     if value is None:
-        raise TaskError(f"{name}: {module} has no {attribute!r}; define it there, or name another")
+        raise TaskError(f"{name}: {module} has no {attribute!r}, nor registers it; define it there, or name another")
     if isinstance(value, Task):
         return dataclasses.replace(value, name=name)
     if callable(value):
@@ -96,21 +122,43 @@ def resolve(name: str) -> Task | None:
 
 
 def _import(module: str, name: str) -> Any:
+    path = Path(module) if module.endswith(".py") else None
+    if path is not None and not path.is_file():
+        advice = "if it has moved, say where: --task path/to/file.py:name"
+        raise TaskError(f"{name}: expected a Python file at {path}, found none; {advice}")
     try:
-        if not module.endswith(".py"):
-            return importlib.import_module(module)
-        path = Path(module).resolve()
-        spec = importlib.util.spec_from_file_location(f"metrpo_task_{path.stem}", path)
-        if spec is None or spec.loader is None or not path.exists():
-            raise TaskError(f"{name}: expected a Python file at {path}, found none")
-        loaded = importlib.util.module_from_spec(spec)
-        sys.modules[spec.name] = loaded
-        spec.loader.exec_module(loaded)
-        return loaded
+        with _on_path(Path.cwd() if path is None else path.parent):
+            return importlib.import_module(module) if path is None else _load(path)
     except TaskError:
         raise
     except Exception as error:
         raise TaskError(f"{name}: cannot import {module} ({type(error).__name__}: {error})") from error
+
+
+def _load(path: Path) -> Any:
+    # Files of one name may lie in several folders.
+    own = f"metrpo_task_{path.stem}_{hashlib.sha256(str(path).encode()).hexdigest()[:8]}"
+    spec = importlib.util.spec_from_file_location(own, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path} is no Python file")
+    loaded = importlib.util.module_from_spec(spec)
+    sys.modules[own] = loaded
+    spec.loader.exec_module(loaded)
+    return loaded
+
+
+@contextmanager
+def _on_path(folder: Path) -> Iterator[None]:
+    """Finds modules in `folder` first, as Python does for a script; after the block last, for imports in functions."""
+    if str(folder) in sys.path:
+        yield
+        return
+    sys.path.insert(0, str(folder))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
+        sys.path.append(str(folder))
 
 
 def _register_dm_control() -> None:

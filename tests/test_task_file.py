@@ -1,0 +1,187 @@
+"""Tasks out of files and modules: neighbours, the current folder, Gymnasium's own form, and files that have moved."""
+
+import dataclasses
+import json
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import gymnasium
+import pytest
+
+from helpers import random_policy
+from metrpo import cli
+from metrpo.config import to_json
+from metrpo.errors import TaskError
+from metrpo.presets import override, preset
+from metrpo.run.policy_file import save_policy
+from metrpo.run.task_file import remember, task_of_run
+from metrpo.stepwise import begin
+from metrpo.training import train
+from metrpo.world import resolve
+from metrpo.world.registry import get_task
+
+MAKE = """
+    import gymnasium
+
+    def make(**kwargs):
+        return gymnasium.make("Pendulum-v1", {horizon}, **kwargs)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _as_before(monkeypatch, tmp_path):
+    """Each test has modules, paths and places of its own, and a current folder."""
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if place])
+    monkeypatch.setattr(resolve, "_PLACES", {})
+    monkeypatch.setattr(gymnasium.envs.registration, "registry", registry := dict(gymnasium.registry))
+    monkeypatch.setattr(gymnasium, "registry", registry)
+    before = set(sys.modules)
+    (tmp_path / "there").mkdir()
+    monkeypatch.chdir(tmp_path)
+    yield
+    for name in set(sys.modules) - before:
+        del sys.modules[name]
+    resolve._resolve.cache_clear()
+
+
+def write(path, text, **fields):
+    Path(path).write_text(textwrap.dedent(text.format(**fields)))
+
+
+def test_a_task_file_finds_its_neighbours(tmp_path):
+    write("there/robot_parts.py", "LENGTH = 7\n")
+    write("there/late_parts.py", "LENGTH = 8\n")
+    write(
+        "there/mine.py",
+        "import robot_parts\n"
+        + textwrap.dedent(MAKE).format(horizon="late()")
+        + textwrap.dedent("""
+        def late():
+            import late_parts
+            return robot_parts.LENGTH + late_parts.LENGTH
+    """),
+    )
+    path = list(sys.path)
+    assert get_task("there/mine.py:make").horizon == 15
+    assert sys.path == [*path, str(tmp_path / "there")], "nothing of Python's own may be shadowed later"
+
+
+def test_a_module_of_the_current_folder_is_found(tmp_path, monkeypatch):
+    write("my_task.py", MAKE, horizon=30)
+    assert get_task("my_task:make").horizon == 30
+    write("there/other_task.py", MAKE, horizon=40)
+    with pytest.raises(TaskError, match=r"cannot import other_task \(ModuleNotFoundError"):
+        get_task("other_task:make")
+
+
+def test_gymnasiums_own_form_imports_what_registers_the_id():
+    write(
+        "my_ids.py",
+        """
+        import gymnasium
+        entry = "gymnasium.envs.classic_control.pendulum:PendulumEnv"
+        gymnasium.register("MyOwn-v3", entry_point=entry, max_episode_steps=60)
+        gymnasium.register("mine/MyOwn-v3", entry_point=entry, max_episode_steps=70)
+    """,
+    )
+    task = get_task("my_ids:MyOwn-v3")
+    assert (task.name, task.horizon) == ("my_ids:MyOwn-v3", 60)
+    assert get_task("my_ids:mine/MyOwn-v3").horizon == 70
+    write(
+        "more_ids.py",
+        """
+        import gymnasium
+        gymnasium.register("MyOwn-v5", entry_point=gymnasium.spec("Pendulum-v1").entry_point, max_episode_steps=80)
+    """,
+    )
+    assert get_task("more_ids.py:MyOwn-v5").horizon == 80
+    with pytest.raises(TaskError, match="my_ids has no 'MyOwn-v4', nor registers it; define it there"):
+        get_task("my_ids:MyOwn-v4")
+
+
+def test_two_files_of_one_name_are_two_tasks(monkeypatch):
+    write("mine.py", MAKE, horizon=20)
+    write("there/mine.py", MAKE, horizon=25)
+    assert (get_task("mine.py:make").horizon, get_task("there/mine.py:make").horizon) == (20, 25)
+    monkeypatch.chdir("there")
+    assert get_task("mine.py:make").horizon == 25, "what the name means here"
+
+
+def a_run(run_dir, task):
+    """What a run of a file's task leaves, as far as evaluating it goes."""
+    run_dir.mkdir()
+    (run_dir / "run.json").write_text('{"format": 1}')
+    remember(run_dir, task)
+    save_policy(run_dir, random_policy(0, 3, 1), task, 1, 200, 1.5)
+
+
+def evaluated(capsys, *arguments):
+    code = cli.main(["evaluate", "--episodes", "1", "--json", *arguments])
+    out, err = capsys.readouterr()
+    return code, json.loads(out)["task"] if out else err
+
+
+def test_a_run_is_evaluated_from_another_folder_and_after_its_file_moved(tmp_path, monkeypatch, capsys):
+    write("there/mine.py", MAKE, horizon=5)
+    monkeypatch.chdir("there")
+    a_run(tmp_path / "run", "mine.py:make")
+    assert evaluated(capsys, "../run") == (0, "mine.py:make")
+    monkeypatch.chdir(tmp_path)
+    assert evaluated(capsys, "run") == (0, "mine.py:make")
+    (tmp_path / "there").rename(tmp_path / "moved")
+    monkeypatch.setattr(resolve, "_PLACES", {})
+    code, said = evaluated(capsys, "run")
+    assert code == 2
+    assert "expected a Python file at " in said
+    assert "found none; if it has moved, say where: --task path/to/file.py:name" in said
+    assert evaluated(capsys, "run", "--task", "moved/mine.py:make") == (0, "mine.py:make")
+
+
+class State(NamedTuple):
+    """Of a run that has learned nothing yet."""
+
+    iteration: int
+    real_steps: int
+    policy: Any
+
+
+@pytest.mark.parametrize("command", [begin, train])
+def test_a_run_remembers_where_its_file_lay(command, tmp_path, monkeypatch):
+    write("mine.py", MAKE, horizon=5)
+    untrained = State(0, 0, random_policy(0, 3, 1))
+    monkeypatch.setattr("metrpo.algorithm.init", lambda config: untrained)
+    monkeypatch.setattr("metrpo.training.finished", lambda config, state: True)
+    command(override(preset("mine.py:make"), {"trust_reward": True}), "run")
+    about = json.loads(Path("run/run.json").read_text())
+    assert about["task_file"] == str(tmp_path / "mine.py")
+    assert about["metrpo"], "what was there stays"
+
+
+def test_every_command_that_plays_or_learns_takes_the_place_anew(monkeypatch, capsys):
+    write("mine.py", MAKE, horizon=5)
+    a_run(Path("run"), "mine.py:make")
+    Path("run/config.json").write_text(to_json(preset("mine.py:make")))
+    Path("mine.py").rename("there/moved.py")
+    resolve._resolve.cache_clear()
+    places = []
+    monkeypatch.setattr(resolve, "place", lambda name, where: places.append((name, where)))
+    monkeypatch.setattr("metrpo.run.machine.prepare", lambda *_, **__: None)
+    for command in ("collect", "improve", "evaluate", "render"):
+        # For `place` is a stub, the file is not found.
+        assert cli.main([command, "run", "--task", "there/moved.py:make"]) == 2
+        assert "mine.py:make: expected a Python file at" in capsys.readouterr().err
+    assert places == [("mine.py:make", "there/moved.py:make")] * 4
+
+
+def test_run_json_of_other_tasks_says_no_file(tmp_path):
+    (tmp_path / "run.json").write_text('{"format": 1}')
+    remember(tmp_path, "Swimmer")
+    assert (tmp_path / "run.json").read_text() == '{"format": 1}'
+    # Made up by somebody else: it names another file than the task does.
+    write("mine.py", MAKE, horizon=5)
+    write("there/evil.py", "raise SystemExit(9)\n")
+    (tmp_path / "run.json").write_text(json.dumps({"format": 1, "task_file": str(tmp_path / "there" / "evil.py")}))
+    assert task_of_run(tmp_path, "mine.py:make").horizon == 5
+    assert dataclasses.is_dataclass(task_of_run(tmp_path, "Swimmer"))
