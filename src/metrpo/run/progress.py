@@ -38,6 +38,9 @@ class Progress:
     def update(self, done: int, note: str = "") -> None:
         """`done` units of the stage are behind; `note` is a short remark such as a loss."""
 
+    def played(self) -> None:
+        """One more real step has been played, in the middle of an episode; a place to stop."""
+
     def end(self, row: Row, seconds_left: float | None = None) -> None:
         """The iteration is finished with these metrics; about so many seconds remain."""
 
