@@ -164,7 +164,7 @@ def test_long_horizon_cuts_imagined_episodes_and_values_the_rest():
     assert (long.advantage.baseline, long.imagine.horizon, long.imagine.start) == ("network", 30, "anywhere")
     # The value of a cut episode leans on itself; exploration leaves the policy recognisable.
     assert long.advantage.discount < 1
-    assert long.collect.max_std < fast.collect.max_std
+    assert long.collect.max_std <= fast.collect.max_std
     assert long.collect.parameter_noise == 0
     # No task of 1,000 steps is asked for more data in an iteration, and the policies are comparable.
     assert long.collect.steps <= fast.collect.steps

@@ -34,6 +34,8 @@ PAPER: dict[str, Overrides] = {
 FAST_ALL: Overrides = {
     "advantage.baseline": "network",
     "advantage.gae_lambda": 0.95,
+    "collect.max_std": 1.0,
+    "collect.parameter_noise": 1.0,
     "ensemble.hidden": (200, 200),
     "ensemble.delta_std_floor": 1e-8,
     "ensemble.std_floor": 1e-8,
@@ -45,7 +47,7 @@ FAST_ALL: Overrides = {
     "fit.reinitialise_every": 0,
     "fit.weight_decay": 0.3,
     "imagine.steps": 40_000,
-    "policy.mean_penalty": 0.05,
+    "policy.mean_penalty": 0.3,
     "policy.normalise": True,
     "validate.max_updates": 100,
     "validate.starts": 50,
@@ -70,7 +72,6 @@ FAST: dict[str, Overrides] = {
 
 LONG_HORIZON_ALL: Overrides = {
     "advantage.discount": 0.99,
-    "collect.max_std": 1.0,
     "collect.parameter_noise": 0.0,
     "collect.steps": 3000,
     "fit.max_steps": 1500,
@@ -83,7 +84,7 @@ LONG_HORIZON_ALL: Overrides = {
     "validate.starts": 100,
 }
 """On top of `fast`: short imagined episodes from anywhere, valued by a network where they are cut; and, as three real
-episodes are all that an iteration gets, these stay close to the policy."""
+episodes are all that an iteration gets, no parameter noise in these."""
 
 SAME_AS = {"HopperUpright": "Hopper", "HumanoidStandup": "Humanoid"}
 """Variants share their task's row."""
