@@ -175,7 +175,7 @@ BROKEN = {
     ),
     "a reward that is not finite": (
         broken(step=lambda self, a: (np.zeros(3, np.float32), np.inf, False, False, {})),
-        r"Mine: step\(\): expected one finite number as reward, got inf; return float\(reward\)",
+        r"Mine: step\(\): expected one finite number as reward, got inf; end the episode before",
     ),
     "two rewards": (
         broken(step=lambda self, a: (np.zeros(3, np.float32), np.zeros(2), False, False, {})),

@@ -108,6 +108,17 @@ def test_python_takes_single_observations_and_says_which_shapes_it_takes(tmp_pat
             act(np.zeros(shape))
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e39])
+def test_an_observation_that_is_not_finite_gets_no_action(tmp_path, value):
+    saved(tmp_path)
+    for act in (python(export(tmp_path)).act, load_policy(tmp_path)):
+        for shape, at in (((S,), [3]), ((4, S), [2, 3])):
+            observation = np.zeros(shape)
+            observation[tuple(at)] = value
+            with pytest.raises(ValueError, match="expected finite numbers, got .* at " + re.escape(str(at))):
+                act(observation)
+
+
 def test_python_describes_itself(tmp_path):
     saved(tmp_path)
     path = export(tmp_path)

@@ -13,6 +13,18 @@ class TaskError(MetrpoError):
     """A task is unknown, or its environment broke its promise."""
 
 
+class EpisodeError(TaskError):
+    """An environment has failed in an episode, which may go better the next time."""
+
+
+class NotFiniteError(EpisodeError):
+    """An environment gave NaN or infinity in an episode, and would again with the same seed."""
+
+
+class UnplayableError(TaskError):
+    """So many episodes of an environment have failed that trying more is of no use."""
+
+
 class DivergedError(MetrpoError):
     """Learning has left the finite numbers for good; nothing of its iteration has been saved."""
 

@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from metrpo.errors import ConfigError
+from metrpo.errors import ConfigError, TaskError
 from metrpo.run.policy_file import LoadedPolicy, load_policy
 from metrpo.run.task_file import task_of_run
 from metrpo.run.video import record
+from metrpo.untrusted import brief
 from metrpo.world import collect
 from metrpo.world.registry import get_task
+from metrpo.world.task import Task
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ def evaluate(
     start states.
 
     Raises `RunDirectoryError` when the directory holds no sound policy, `TaskError` for an unknown task, `ConfigError`
-    for fewer than one episode or a function without a task.
+    for fewer than one episode or a function without a task; `TaskError` also for a policy of another task's sizes.
     """
     if episodes < 1:
         raise ConfigError(f"episodes: expected at least 1, got {episodes}")
@@ -74,6 +76,8 @@ def evaluate(
         known = get_task(name)
     else:
         raise ConfigError("task: expected the task that this function is to be evaluated on, got none")
+    if isinstance(act, LoadedPolicy):
+        _require_fit(act, known)
     return EvaluationResult(known.name, seed, collect.evaluate(known, act, episodes, seed))
 
 
@@ -88,9 +92,20 @@ def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0, ta
     _require_seed(seed)
     policy = load_policy(run_dir)
     known = task_of_run(run_dir, policy.info.task, task)
+    _require_fit(policy, known)
     return record(known.make_env, policy, Path(out or Path(run_dir) / "video.mp4"), seed)
 
 
 def _require_seed(seed: int) -> None:
     if seed < 0:
         raise ConfigError(f"seed: expected at least 0, got {seed}")
+
+
+def _require_fit(policy: LoadedPolicy, task: Task) -> None:
+    has = (policy.info.observation_size, policy.info.action_size)
+    if has != (task.state_size, task.action_size):
+        raise TaskError(
+            f"{task.name}: expected a policy of {task.state_size} observed numbers and {task.action_size} actions, got "
+            f"one of {has[0]} and {has[1]}, trained on {brief(policy.info.task)}; name that task, or train one for "
+            "this"
+        )

@@ -166,11 +166,15 @@ INFO = $info_literal
 
 
 def act(observation):
-    """The action, in [-1, 1], float32: [S] -> [A] or [B, S] -> [B, A]; ValueError for other shapes."""
-    hidden = np.asarray(observation, dtype=np.float32)
+    """The action, in [-1, 1], float32: [S] -> [A] or [B, S] -> [B, A]; ValueError for other shapes, NaN or infinity."""
+    with np.errstate(over="ignore"):
+        hidden = np.asarray(observation, dtype=np.float32)
     if hidden.ndim not in (1, 2) or hidden.shape[-1] != OBSERVATION_SIZE:
         size = OBSERVATION_SIZE
         raise ValueError(f"observation: expected shape [{size}] or [B, {size}], got {list(hidden.shape)}")
+    if not np.isfinite(hidden).all():
+        at = np.argwhere(~np.isfinite(hidden))[0]
+        raise ValueError(f"observation: expected finite numbers, got {hidden[tuple(at)]} at {at.tolist()}")
     for weights, bias in _LAYERS[:-1]:
         hidden = np.tanh(hidden @ weights + bias)
     weights, bias = _LAYERS[-1]

@@ -64,12 +64,16 @@ class LoadedPolicy:
     def __call__(self, observation: Any) -> np.ndarray:
         """The action, in [-1, 1], float32: [S] -> [A] or [B, S] -> [B, A].
 
-        Raises `ValueError` when the observation has another shape.
+        Raises `ValueError` when the observation has another shape, or is not finite in float32.
         """
-        hidden = np.asarray(observation, dtype=np.float32)
+        with np.errstate(over="ignore"):
+            hidden = np.asarray(observation, dtype=np.float32)
         size = self.info.observation_size
         if hidden.ndim not in (1, 2) or hidden.shape[-1] != size:
             raise ValueError(f"observation: expected shape [{size}] or [B, {size}], got {list(hidden.shape)}")
+        if not np.isfinite(hidden).all():
+            at = np.argwhere(~np.isfinite(hidden))[0]
+            raise ValueError(f"observation: expected finite numbers, got {hidden[tuple(at)]} at {at.tolist()}")
         for weights, bias in self.layers[:-1]:
             hidden = np.tanh(hidden @ weights + bias)
         weights, bias = self.layers[-1]

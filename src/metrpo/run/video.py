@@ -18,6 +18,7 @@ import numpy as np
 from metrpo.errors import MetrpoError
 from metrpo.gl import INSTALL_GL
 from metrpo.run.files import temporary_path
+from metrpo.world import returned
 
 INSTALL_EXTRA = "pip install 'metrpo[video]'"
 _GL = ("mujoco", "OpenGL", "glfw", "pyglet")
@@ -101,7 +102,7 @@ def _episode(
         env = make_env(render_mode="rgb_array")
     except Exception as error:  # whatever somebody's constructor raises
         raise _blame(error, 'the environment cannot be made with render_mode="rgb_array"') from error
-    try:
+    with returned.closing(env, "the environment"):
         observation, _ = env.reset(seed=seed)
         frames, over = [_frame(env)], False
         while not over:
@@ -109,8 +110,6 @@ def _episode(
             over = terminated or truncated
             frames.append(_frame(env))
         return frames, int(env.metadata.get("render_fps", 30))
-    finally:
-        env.close()
 
 
 def _frame(env: Any) -> np.ndarray:

@@ -23,7 +23,9 @@ def check_formulas(task: Task, rng: np.random.Generator) -> None:
     """
     if task.reward is None and not callable(task.terminated):
         return
-    episodes = real.collect(task, lambda rng: lambda state: rng.uniform(-1.0, 1.0, task.action_size), STEPS, rng)
+    episodes = real.collect(
+        task, lambda rng: lambda state: rng.uniform(-1.0, 1.0, task.action_size), STEPS, rng, longest=STEPS
+    )
     if task.reward is not None:
         _check_rewards(task, episodes)
     if callable(task.terminated):

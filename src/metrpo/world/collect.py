@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import itertools
+import logging
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
+from functools import partial
 from typing import Any
 
 import gymnasium
 import numpy as np
 
 from metrpo.config import CollectConfig
-from metrpo.errors import DivergedError, TaskError
+from metrpo.errors import DivergedError, EpisodeError, NotFiniteError, TaskError, UnplayableError
 from metrpo.types import Episode
-from metrpo.world.guard import representable
+from metrpo.world import returned
+from metrpo.world.returned import representable
 from metrpo.world.task import Task
 
 Act = Callable[[np.ndarray], np.ndarray]
 """State [S] -> action [A], not yet clipped."""
 OnEpisode = Callable[[int], None]
 """Called after every episode with the steps so far."""
+MOST_FAILURES = 10
+"""Episodes of one collection, or resets, that may fail and are left out."""
+
+_log = logging.getLogger("metrpo")
 
 
 def collect(
@@ -28,55 +35,89 @@ def collect(
     at_least: int,
     rng: np.random.Generator,
     on_episode: OnEpisode = lambda steps: None,
+    longest: int | None = None,
 ) -> list[Episode]:
     """Whole episodes of `at_least` steps together; `draw_act(rng)` acts in one episode and brings its own noise.
 
-    `on_episode(steps so far)` follows every episode.
+    An episode of more than `longest` steps is cut there. One in which the environment gives NaN or infinity is left
+    out, with a warning. `on_episode(steps so far)` follows every other.
+
+    Raises `UnplayableError` when more than `MOST_FAILURES` are left out, `TaskError` as `play`.
     """
     episodes: list[Episode] = []
-    steps = 0
-    with closing(play(task, draw_act, itertools.repeat(rng))) as played:
-        while steps < at_least:
-            episodes.append(next(played))
-            steps += len(episodes[-1].rewards)
-            on_episode(steps)
+    steps = failed = 0
+    while steps < at_least:
+        try:
+            with closing(play(task, draw_act, itertools.repeat(rng), longest)) as played:
+                while steps < at_least:
+                    episodes.append(next(played))
+                    steps += len(episodes[-1].rewards)
+                    on_episode(steps)
+        except NotFiniteError as error:
+            failed += 1
+            leave_out(failed, error)
     return episodes
 
 
+def leave_out(failed: int, error: EpisodeError) -> None:
+    """Says that an episode, the `failed`-th of its collection, is left out.
+
+    Raises `UnplayableError` when there have been too many.
+    """
+    if failed > MOST_FAILURES:
+        text = f"{error}. {MOST_FAILURES} episodes before it failed too: repair the environment, then go on"
+        raise UnplayableError(text) from error
+    _log.warning("%s; this episode is left out (number %d of at most %d)", error, failed, MOST_FAILURES)
+
+
 def play(
-    task: Task, draw_act: Callable[[np.random.Generator], Act], rngs: Iterable[np.random.Generator]
+    task: Task,
+    draw_act: Callable[[np.random.Generator], Act],
+    rngs: Iterable[np.random.Generator],
+    longest: int | None = None,
+    on_step: Callable[[], None] = lambda: None,
 ) -> Generator[Episode]:
     """One whole episode for each of `rngs`, which decides its start and its noise; `draw_act(rng)` acts in it.
 
-    Raises `TaskError` where the environment gives NaN or infinity, `DivergedError` where the policy gives NaN.
+    An episode of more than `longest` steps is cut there, as by the clock. `on_step` is called at every step.
+
+    Raises `EpisodeError` where the environment fails or breaks its promise (`NotFiniteError` where it gives NaN or
+    infinity), `TaskError` where the policy is another task's, `DivergedError` where it gives NaN.
     """
-    env = task.make_env()
-    try:
+    with returned.closing(task.make_env(), task.name) as env:
         for rng in rngs:
-            yield _episode(task.name, env, draw_act(rng), _seed(rng))
-    finally:
-        env.close()
+            yield _episode(task, env, draw_act(rng), _seed(rng), longest, on_step)
 
 
-def evaluate(task: Task, act: Act, episodes: int, seed: int) -> np.ndarray:
-    """Real, undiscounted returns [episodes] of `act` without any noise, from seeded resets."""
+def evaluate(task: Task, act: Act, episodes: int, seed: int, at_most: int | None = None) -> np.ndarray:
+    """Real, undiscounted returns [episodes] of `act` without any noise, from seeded resets.
+
+    Fewer where the first ones have `at_most` steps together.
+    """
     rng = np.random.default_rng(seed)
-    env = task.make_env()
-    try:
-        return np.array(
-            [_episode(task.name, env, act, _seed(rng)).rewards.sum(dtype=np.float64) for _ in range(episodes)]
-        )
-    finally:
-        env.close()
+    returns, steps = list[float](), 0
+    with returned.closing(task.make_env(), task.name) as env:
+        while len(returns) < episodes and (at_most is None or steps < at_most):
+            rewards = _episode(task, env, act, _seed(rng)).rewards
+            returns.append(rewards.sum(dtype=np.float64))
+            steps += len(rewards)
+    return np.array(returns)
 
 
 def reset_states(task: Task, count: int, rng: np.random.Generator) -> np.ndarray:
-    """States [count, S] of fresh resets (real interaction that nobody counts: `imagine.start = "reset"`)."""
-    env = task.make_env()
-    try:
-        return np.array([_start(task.name, env, _seed(rng)) for _ in range(count)], np.float32)
-    finally:
-        env.close()
+    """States [count, S] of fresh resets (real interaction that nobody counts: `imagine.start = "reset"`).
+
+    Resets that give NaN or infinity are left out, as in `collect`.
+    """
+    states, failed = list[np.ndarray](), 0
+    with returned.closing(task.make_env(), task.name) as env:
+        while len(states) < count:
+            try:
+                states.append(_start(task, env, _seed(rng)))
+            except NotFiniteError as error:
+                failed += 1
+                leave_out(failed, error)
+    return np.array(states, np.float32)
 
 
 def explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
@@ -98,45 +139,86 @@ def explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
     return act
 
 
-def _episode(name: str, env: gymnasium.Env, act: Act, seed: int) -> Episode:
-    state = _start(name, env, seed)
-    states, rewards = [state], []
+def _episode(
+    task: Task,
+    env: gymnasium.Env,
+    act: Act,
+    seed: int,
+    longest: int | None = None,
+    on_step: Callable[[], None] = lambda: None,
+) -> Episode:
+    state = _start(task, env, seed)
+    states, rewards = [state], list[float]()
     actions: list[np.ndarray] = []
     terminated = truncated = False
-    while not (terminated or truncated):
-        action = np.clip(act(state), -1.0, 1.0).astype(np.float32)
-        if np.isnan(action).any():
-            raise DivergedError(
-                f"{name}: step {len(actions)} of an episode: expected numbers as action, got {action.tolist()}; "
-                "the policy has diverged: go back to one from before, or start anew"
-            )
-        try:
-            state, reward, terminated, truncated, _ = env.step(action)
-        except TaskError as error:
-            raise TaskError(f"{error} (at step {len(actions)} of an episode)") from error
-        _require_numbers(f"{name}: step {len(actions)} of an episode", state, reward)
+    longest = task.horizon if longest is None else min(longest, task.horizon)
+    while not (terminated or truncated) and len(actions) < longest:
+        on_step()
+        where = f"step {len(actions)} of an episode"
+        action = action_of(task, act(state), where)
+        with _of_episode(f" (at {where})"):
+            observation, reward, terminated, truncated, _ = returned.after_step(task.name, partial(env.step, action))
+        state = _numbers(task, where, observation, reward)
         states.append(state)
         actions.append(action)
         rewards.append(reward)
     return Episode(
-        np.array(states, np.float32), np.array(actions, np.float32), np.array(rewards, np.float32), bool(terminated)
+        np.array(states, np.float32), np.array(actions, np.float32), np.array(rewards, np.float32), terminated
     )
 
 
-def _start(name: str, env: gymnasium.Env, seed: int) -> np.ndarray:
-    state: np.ndarray = env.reset(seed=seed)[0]
-    _require_numbers(f"{name}: reset()", state, 0.0)
-    return state
+def action_of(task: Task, given: np.ndarray, where: str) -> np.ndarray:
+    """The action [A], within [-1, 1], that a policy of `task` has `given`.
+
+    Raises `TaskError` when its size is another than the task's, `DivergedError` when it holds NaN.
+    """
+    array = returned.array_of(given)
+    if array is None or array.size != task.action_size or array.ndim > 1:
+        got = f"{given!r}" if array is None else f"shape {list(array.shape)}"
+        raise TaskError(
+            f"{task.name}: {where}: expected an action of {task.action_size} numbers, got {got}; use a policy that was "
+            "made for this task"
+        )
+    action = np.clip(array, -1.0, 1.0).astype(np.float32).reshape(task.action_size)
+    if np.isnan(action).any():
+        raise DivergedError(
+            f"{task.name}: {where}: expected numbers as action, got {action.tolist()}; "
+            "the policy has diverged: go back to one from before, or start anew"
+        )
+    return action
 
 
-def _require_numbers(where: str, state: np.ndarray, reward: Any) -> None:
-    """Not every environment is `Guarded`: those that are our own or have formulas may come as they are."""
+@contextmanager
+def _of_episode(where: str = "") -> Iterator[None]:
+    """What goes wrong in a call of the environment is an `EpisodeError` that says `where`."""
+    try:
+        yield
+    except TaskError as error:
+        kind = type(error) if isinstance(error, EpisodeError) else EpisodeError
+        raise kind(f"{error}{where}") from error
+
+
+def _start(task: Task, env: gymnasium.Env, seed: int) -> np.ndarray:
+    with _of_episode():
+        observation, _ = returned.after_reset(task.name, partial(env.reset, seed=seed))
+    return _numbers(task, "reset()", observation, 0.0)
+
+
+def _numbers(task: Task, where: str, observation: Any, reward: float) -> np.ndarray:
+    """The observation as a state [S]; not every environment is `Guarded`: those of a `Task` may come as they are."""
+    state = returned.array_of(observation)
+    if state is None or state.shape != (task.state_size,):
+        got = observation if state is None else f"shape {list(state.shape)}"
+        advice = "return an array of so many numbers, or make the task by metrpo.task_of, which flattens others"
+        expected = f"an observation of {task.state_size} numbers"
+        raise returned.broken(task.name, where, expected, got, advice, EpisodeError)
     for what, value in (("observation", state), ("reward", reward)):
         if not representable(value):
-            raise TaskError(
-                f"{where}: expected finite numbers below 1.7e38 as {what}, got {value}; "
+            raise NotFiniteError(
+                f"{task.name}: {where}: expected finite numbers below 1.7e38 as {what}, got {value}; "
                 "end the episode before the simulation diverges"
             )
+    return state
 
 
 def _seed(rng: np.random.Generator) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium
@@ -10,15 +9,13 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
-from metrpo.errors import MetrpoError, TaskError
+from metrpo.errors import NotFiniteError, TaskError
+from metrpo.world import returned
+from metrpo.world.limits import require_size
+from metrpo.world.returned import broken, representable
 
-_MOST = float(np.finfo(np.float32).max) / 2
-"""Beyond this the difference of two numbers may be infinite in float32, in which everything is learned."""
-
-
-def representable(numbers: Any) -> bool:
-    """Whether all are finite, and stay so in float32 when one is taken from another."""
-    return bool(np.all(np.abs(numbers) <= _MOST))  # false for NaN
+_HUGE = 1e9
+"""A bound as large as this says that there is none: an action in [-1, 1] would stand for numbers that nobody wants."""
 
 
 class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
@@ -32,24 +29,28 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     def __init__(self, env: gymnasium.Env[Any, Any], name: str, horizon: int | None = None) -> None:
         self._env, self._name, self._horizon, self._steps = env, name, horizon, 0
         self.metadata, self.render_mode = env.metadata, env.render_mode
-        actions = env.action_space
+        refuse_running_statistics(env, name)
+        actions: Any = getattr(env, "action_space", None)
+        space: Any = getattr(env, "observation_space", None)
         if not (isinstance(actions, Box) and np.issubdtype(actions.dtype, np.floating)):
             advice = "metrpo learns continuous control; discretised actions can be made continuous by a wrapper"
-            raise self._broken("action_space", "a Box of floats", actions, advice)
-        if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
-            raise self._broken(
+            raise broken(name, "action_space", "a Box of floats", actions, advice)
+        if not (np.abs(actions.low) < _HUGE).all() or not (np.abs(actions.high) < _HUGE).all():
+            raise broken(
+                name,
                 "action_space",
-                "finite bounds, to which actions in [-1, 1] are rescaled",
+                "finite bounds, to which actions in [-1, 1] are rescaled (1e9 or more counts as infinite)",
                 actions,
-                "wrap it in gymnasium.wrappers.ClipAction or give the Box finite low and high",
+                "give the Box the range that the motors have, or wrap the environment: gymnasium.wrappers."
+                "TransformAction(env, lambda action: action, gymnasium.spaces.Box(low, high, shape))",
             )
-        self._low, self._span = actions.low.astype(np.float64), (actions.high - actions.low).astype(np.float64)
-        self._action_shape, self._action_dtype = actions.shape, actions.dtype
-        space = env.observation_space
         if not _is_numeric(space):
             advice = "encode it as numbers, for example with a gymnasium.ObservationWrapper"
-            raise self._broken("observation_space", "a Box, or a Dict or Tuple of them", space, advice)
+            raise broken(name, "observation_space", "a Box, or a Dict or Tuple of them", space, advice)
+        self._actions, self._observations = actions, space
+        self._low, self._high = actions.low.astype(np.float64), actions.high.astype(np.float64)
         self._size = int(gymnasium.spaces.flatdim(space))
+        require_size(name, self._size)
         self.action_size = int(np.prod(actions.shape))
         self.observation_space = Box(-np.inf, np.inf, (self._size,), np.float64)
         self.action_space = Box(-1.0, 1.0, (self.action_size,), np.float32)
@@ -60,33 +61,36 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     ) -> tuple[NDArray[np.float64], dict[str, Any]]:
         """A new episode: state [S] and the environment's info."""
         super().reset(seed=seed)
-        result = self._call("reset", lambda: self._env.reset(seed=seed, options=options))
-        if not (isinstance(result, tuple) and len(result) == 2):
-            raise self._broken("reset()", "(observation, info)", result, "return both, as Gymnasium does since 0.26")
+        observation, info = returned.after_reset(self._name, lambda: self._env.reset(seed=seed, options=options))
         self._over, self._steps = False, 0
-        return self._state(result[0], "reset()"), dict(result[1] or {})
+        return self._state(observation, "reset()"), info
 
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
         """One step with an action in [-1, 1]: state [S], reward, terminated, truncated, info."""
         if self._over:
             raise TaskError(f"{self._name}: step() was called after the end of an episode: call reset() first")
-        scaled = self._low.ravel() + 0.5 * (np.clip(np.asarray(action, np.float64), -1, 1) + 1) * self._span.ravel()
-        given = scaled.reshape(self._action_shape).astype(self._action_dtype)
-        result = self._call("step", lambda: self._env.step(given))
-        if not (isinstance(result, tuple) and len(result) == 5):
-            expected = "(observation, reward, terminated, truncated, info)"
-            raise self._broken("step()", expected, result, "return all five, as Gymnasium does since 0.26")
-        observation, reward, terminated, truncated, info = result
+        given = self._rescaled(action)
+        observation, reward, terminated, truncated, info = returned.after_step(
+            self._name, lambda: self._env.step(given)
+        )
         state = self._state(observation, "step()")
-        if np.size(reward) != 1 or not representable(np.asarray(reward, np.float64)):
-            raise self._broken("step()", "one finite number as reward", reward, "return float(reward)")
-        for flag, value in (("terminated", terminated), ("truncated", truncated)):
-            if not isinstance(value, bool | np.bool_):
-                raise self._broken("step()", f"a bool as {flag}", value, f"return bool({flag})")
+        if not representable(reward):
+            advice = "end the episode before the simulation diverges"
+            raise broken(self._name, "step()", "one finite number as reward", reward, advice, NotFiniteError)
         self._steps += 1
-        truncated = bool(truncated) or self._steps == self._horizon
-        self._over = bool(terminated) or truncated
-        return state, float(np.asarray(reward).item()), bool(terminated), truncated, dict(info or {})
+        truncated = truncated or self._steps == self._horizon
+        self._over = terminated or truncated
+        return state, reward, terminated, truncated, info
+
+    def _rescaled(self, action: NDArray[np.float32]) -> NDArray[Any]:
+        """The action in the environment's own range and type, never beyond its bounds."""
+        wanted = np.asarray(action, np.float64)
+        if wanted.shape != (self.action_size,):
+            expected, got = f"an action of {self.action_size} numbers", f"shape {list(wanted.shape)}"
+            raise broken(self._name, "step()", expected, got, "use a policy that was made for this task")
+        part = 0.5 * (np.clip(wanted, -1, 1) + 1).reshape(self._actions.shape)
+        scaled = (self._low + part * (self._high - self._low)).astype(self._actions.dtype)
+        return np.clip(scaled, self._actions.low, self._actions.high)  # the last bit may have been rounded beyond
 
     @property
     def time_limit(self) -> int | None:
@@ -108,36 +112,51 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         """Closes the environment."""
         self._env.close()
 
-    def _call(self, name: str, call: Callable[[], Any]) -> Any:
-        try:
-            return call()
-        except MetrpoError:
-            raise
-        except Exception as error:
-            raise TaskError(
-                f"{self._name}: {name}() raised {type(error).__name__}: {error}; "
-                "make the environment run by itself first (gymnasium.utils.env_checker.check_env helps)"
-            ) from error
-
     def _state(self, observation: Any, call: str) -> NDArray[np.float64]:
-        space = self._env.observation_space
+        space = self._observations
         try:
             state = np.asarray(gymnasium.spaces.flatten(space, observation), np.float64).ravel()
         except Exception as error:
             advice = f"return observations of the space ({type(error).__name__}: {error})"
-            raise self._broken(call, f"an observation of {space}", observation, advice) from error
+            raise broken(self._name, call, f"an observation of {space}", observation, advice) from error
         if (isinstance(space, Box) and np.shape(observation) != space.shape) or state.size != self._size:
             got = f"shape {list(np.shape(observation))}"
             advice = "shapes may not change within a run"
-            raise self._broken(call, f"an observation of shape {list(space.shape or (self._size,))}", got, advice)
+            raise broken(self._name, call, f"an observation of shape {list(space.shape or (self._size,))}", got, advice)
         if not representable(state):
             where = next(i for i, number in enumerate(state) if not representable(number))
             advice = "end the episode before the simulation diverges, or repair the sensor"
-            raise self._broken(call, "finite numbers", f"{state[where]} at index {where}", advice)
+            got = f"{state[where]} at index {where}"
+            raise broken(self._name, call, "finite numbers", got, advice, NotFiniteError)
         return state
 
-    def _broken(self, call: str, expected: str, got: object, advice: str) -> TaskError:
-        return TaskError(f"{self._name}: {call}: expected {expected}, got {_short(got)}; {advice}")
+
+def refuse_running_statistics(env: Any, name: str) -> None:
+    """Raises `TaskError` where an environment, or a wrapper in it, keeps running statistics to normalise by.
+
+    Gymnasium's NormalizeObservation and NormalizeReward do, and whatever keeps its statistics under the same names.
+    """
+    layers, seen = [env], set[int]()
+    while layers:
+        layer = layers.pop()
+        own = getattr(layer, "__dict__", {})
+        seen.add(id(layer))
+        layers += [own[inner] for inner in _INNER if id(own.get(inner)) not in seen and own.get(inner) is not None]
+        frozen = getattr(layer, "update_running_mean", True) is False
+        if any(statistics in own for statistics in _STATISTICS) and not frozen:
+            raise broken(
+                name,
+                type(layer).__name__,
+                "observations and rewards that mean the same in every episode",
+                "a wrapper with running statistics, which are lost whenever a fresh environment is made",
+                "leave it out: metrpo normalises what it learns from by itself",
+            )
+
+
+_STATISTICS = ("obs_rms", "return_rms", "ret_rms")
+"""Names of running statistics in the wrappers of Gymnasium and Stable-Baselines3."""
+_INNER = ("env", "_env", "venv", "gym_env")
+"""Where wrappers keep what they wrap."""
 
 
 def _is_numeric(space: Any) -> bool:
@@ -146,8 +165,3 @@ def _is_numeric(space: Any) -> bool:
     if isinstance(space, gymnasium.spaces.Tuple):
         return all(_is_numeric(inner) for inner in space.spaces)
     return isinstance(space, Box)
-
-
-def _short(value: object) -> str:
-    text = value if isinstance(value, str) else repr(value)
-    return text if len(text) <= 100 else f"{text[:97]}..."

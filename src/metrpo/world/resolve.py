@@ -17,7 +17,9 @@ import gymnasium
 
 from metrpo.errors import TaskError
 from metrpo.types import Array
+from metrpo.world import returned
 from metrpo.world.guard import Guarded
+from metrpo.world.limits import require_horizon
 from metrpo.world.task import Task
 
 _DM_CONTROL_STEPS = 1000
@@ -47,13 +49,12 @@ def task_of(
     """
     called = name or (env if isinstance(env, str) else str(getattr(env, "__name__", type(env).__name__)))
     make = partial(_make, env, called, horizon)
-    with_limit = make()
-    try:
+    with returned.closing(make(), called) as with_limit:
+        if with_limit.time_limit is not None:
+            require_horizon(called, with_limit.time_limit)
         state, _ = with_limit.reset(seed=0)
         with_limit.step(with_limit.action_space.sample())
         actions, limit = with_limit.action_size, with_limit.time_limit
-    finally:
-        with_limit.close()
     if limit is None:
         raise TaskError(
             f"{called}: expected an environment with a time limit, got none: register it with max_episode_steps, wrap "

@@ -10,6 +10,8 @@ import gymnasium
 
 from metrpo.errors import TaskError
 from metrpo.types import Array
+from metrpo.world.guard import refuse_running_statistics
+from metrpo.world.limits import require_horizon, require_size
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,10 @@ class Task:
     make: Callable[..., gymnasium.Env] | None = None
     """Makes the environment, in place of `gymnasium.make(env_id)`."""
 
+    def __post_init__(self) -> None:
+        require_size(self.name, self.state_size)
+        require_horizon(self.name, self.horizon)
+
     @property
     def playable(self) -> bool:
         """Whether there is an environment to step."""
@@ -51,13 +57,23 @@ class Task:
     def make_env(self, **kwargs: Any) -> gymnasium.Env:
         """A fresh environment with the time limit of the task (`kwargs` such as `render_mode="rgb_array"`).
 
-        Raises `TaskError` when there is none.
+        Raises `TaskError` when there is none, and for wrappers with running statistics (`world.guard`).
         """
+        made = self._made(**kwargs)
+        refuse_running_statistics(made, self.name)
+        return made
+
+    def _made(self, **kwargs: Any) -> gymnasium.Env:
         if self.make is not None:
             return self.make(**kwargs)
-        if self.env_id is None:
+        self.require_playable()
+        assert self.env_id is not None
+        return gymnasium.make(self.env_id, **kwargs)
+
+    def require_playable(self) -> None:
+        """Raises `TaskError` when there is no environment to step."""
+        if not self.playable:
             raise TaskError(
                 f"{self.name}: expected an environment, got none: its episodes come from another program "
                 "(metrpo.append_episode, or metrpo collect DIR --data FILE) and metrpo improve DIR learns from them"
             )
-        return gymnasium.make(self.env_id, **kwargs)

@@ -1,0 +1,33 @@
+"""What is too large to be learned, refused before the first real step."""
+
+from __future__ import annotations
+
+from metrpo.config import CollectConfig
+from metrpo.errors import TaskError
+
+MOST_NUMBERS = 4000
+"""Of an observation: dense networks learn what joints and sensors say, not pictures."""
+LONGEST = 100_000
+"""Steps of an episode: every policy update imagines, and every evaluation plays, whole ones."""
+
+
+def require_size(name: str, size: int) -> None:
+    """Raises `TaskError` for observations of more than `MOST_NUMBERS` numbers, with the room that they would take."""
+    if size > MOST_NUMBERS:
+        kept = CollectConfig.max_train + CollectConfig.max_validation
+        raise TaskError(
+            f"{name}: expected observations of at most {MOST_NUMBERS:,} numbers, got {size:,}: a full dataset of "
+            f"{kept:,} transitions would take {kept * size * 8 / 2**30:,.0f} GiB; pictures cannot be learned here: "
+            "give positions and velocities instead, or features that a network of yours makes of the picture (a "
+            "gymnasium.ObservationWrapper)"
+        )
+
+
+def require_horizon(name: str, horizon: int) -> None:
+    """Raises `TaskError` for episodes of less than one step or of more than `LONGEST`."""
+    if not 1 <= horizon <= LONGEST:
+        raise TaskError(
+            f"{name}: expected episodes of 1 to {LONGEST:,} steps, got a time limit of {horizon:,}; cut them with "
+            "metrpo.task_of(..., horizon=1000), or with gymnasium.wrappers.TimeLimit(env, 1000): that is no end of the "
+            "task to the models"
+        )
