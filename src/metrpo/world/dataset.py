@@ -9,6 +9,9 @@ import numpy as np
 from metrpo.config import CollectConfig
 from metrpo.types import Episode, Transitions
 
+ROOM = 640 << 20
+"""Bytes of transitions for which room is made at once: 200,000 of the widest of Gymnasium's robots."""
+
 
 class Dataset(NamedTuple):
     """All real data that learning sees; host arrays, a pytree."""
@@ -57,8 +60,13 @@ def add(
     )
 
 
-def with_capacity(transitions: Transitions, capacity: int) -> Transitions:
-    """The same transitions in arrays of `capacity` rows: the fixed shape that compiled code wants."""
+def with_capacity(transitions: Transitions, most: int) -> Transitions:
+    """The same transitions in longer arrays, of `most` rows at most: the fixed shape that compiled code wants.
+
+    Of `most` at once where that takes little room; else of as many as do, doubled until the transitions fit, so that
+    code is compiled anew a few times only.
+    """
+    capacity = _capacity(transitions, most)
 
     def padded(rows: np.ndarray) -> np.ndarray:
         out = np.zeros((capacity, rows.shape[1]), np.float32)
@@ -67,6 +75,14 @@ def with_capacity(transitions: Transitions, capacity: int) -> Transitions:
 
     t = transitions
     return Transitions(padded(t.states), padded(t.actions), padded(t.deltas), np.int32(t.size))
+
+
+def _capacity(transitions: Transitions, most: int) -> int:
+    row = 4 * sum(rows.shape[1] for rows in transitions[:3])
+    capacity = max(1, ROOM // row)
+    while capacity < len(transitions.states):
+        capacity *= 2
+    return min(capacity, most)
 
 
 def append(old: Transitions, episodes: list[Episode], most: int, learned: tuple[str, ...] = ()) -> Transitions:
