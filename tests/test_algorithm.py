@@ -190,7 +190,7 @@ def test_rows_say_what_happened(tiny):
 def test_the_reported_return_is_the_accepted_policys_without_noise(tiny, monkeypatch):
     seen = {}
 
-    def evaluate(task, act, episodes, seed):
+    def evaluate(task, act, episodes, seed, at_most):
         seen.update(act=act, episodes=episodes, seed=seed)
         return np.array([1.0, 4.0])
 

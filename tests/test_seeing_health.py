@@ -94,6 +94,8 @@ CASES = [
         "Validation loss 20",
     ),
     ("not-finite", changed(12, return_imagined=NAN), CONFIG, 12, "No finite number in return_imagined"),
+    ("not-evaluated", changed(10, return_real=NAN, gap=NAN), CONFIG, 10, "No real return"),
+    ("failed-episodes", changed(3, failed_episodes=2), CONFIG, 3, "20 real episodes left out"),
     ("std-collapsed", changed(4, mean_std=0.05), CONFIG, 4, "Standard deviation of the policy 0.05, at first 1"),
     ("policy-saturated", changed(5, saturated=0.8), CONFIG, 5, "80% of the policy's mean actions beyond the limits"),
     ("updates-rejected", changed(3, rejected_steps=80, updates=99), CONFIG, 3, "81% of the updates rejected"),

@@ -18,20 +18,21 @@ from __future__ import annotations
 import itertools
 import logging
 import math
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeVar
 
 import jax
 import numpy as np
 
 from metrpo import phase
 from metrpo.config import Config
-from metrpo.errors import ConfigError, DivergedError
+from metrpo.errors import ConfigError, DivergedError, EpisodeError, MetrpoError, NotFiniteError
 from metrpo.finite import naming, require_finite
 from metrpo.model import ensemble as ensembles
-from metrpo.model.calibration import end_calibration
-from metrpo.model.diagnostics import diagnose
+from metrpo.model.calibration import Calibration, end_calibration
+from metrpo.model.diagnostics import Diagnosis, diagnose, unknown
 from metrpo.model.ensemble import Ensemble, Networks
 from metrpo.model.fit import FitInfo, fit, refit
 from metrpo.phase import PhaseInfo
@@ -51,6 +52,9 @@ from metrpo.world.registry import get_task, without_formulas
 from metrpo.world.task import Task
 
 _log = logging.getLogger("metrpo")
+EVALUATION_STEPS = 200_000
+"""Real steps of one evaluation after which no other episode begins: a record must not take longer than learning."""
+T = TypeVar("T")
 Row = dict[str, float | int]
 """One iteration's metrics, in the order of metrics.csv's columns."""
 
@@ -108,13 +112,46 @@ class Log(Protocol):
     def append(self, episode: Episode) -> object:
         """Keeps one more."""
 
+    def failures(self) -> Mapping[int, bool]:
+        """The episodes of this iteration in which the environment failed, and whether each is left out for good."""
+
+    def note_failures(self, failures: Mapping[int, bool]) -> None:
+        """Keeps them."""
+
+
+class Unkept:
+    """A log of nothing but the failures of one iteration."""
+
+    def __init__(self) -> None:
+        self._failures: Mapping[int, bool] = {}
+
+    def pending(self) -> list[Episode]:
+        """None."""
+        return []
+
+    def append(self, episode: Episode) -> None:
+        """Forgotten."""
+
+    def failures(self) -> Mapping[int, bool]:
+        """The last ones noted."""
+        return self._failures
+
+    def note_failures(self, failures: Mapping[int, bool]) -> None:
+        """Remembered."""
+        self._failures = dict(failures)
+
 
 def step(config: Config, state: State, progress: Progress = SILENT, log: Log | None = None) -> tuple[State, Row]:
     """One outer iteration: collect, fit, improve until the ensemble disagrees; and evaluate, for the record only."""
-    clock = Clock()
+    clock, log = Clock(), log or Unkept()
     with clock("collect"):
         episodes = collect(config, state, progress, log)
-    return learn(config, state, episodes, progress, clock)
+    return learn(config, state, episodes, progress, clock, left_out(log))
+
+
+def left_out(log: Log) -> int:
+    """Episodes of this iteration that are played no more, for the environment failed in them."""
+    return sum(log.failures().values())
 
 
 def collect(
@@ -122,37 +159,71 @@ def collect(
 ) -> list[Episode]:
     """The real episodes of the next iteration: those that wait in `log`, and more until they have enough steps.
 
-    Enough are `at_least`, or as many as the config asks for. New ones go to `log` as they end; what a run that was
-    stopped has collected is not collected again.
+    Enough are `at_least`, or as many as the config asks for; an episode of more steps than the config asks for is cut
+    there. New ones go to `log` as they end; what a run that was stopped has collected is not collected again.
+
+    An episode in which the environment gives NaN or infinity is left out for good: its seed would give the same again.
+    So is one that fails otherwise, but in its second try: the first ends the run. Raises `UnplayableError` when too
+    many are left out, `EpisodeError` for another failure.
     """
     enough = (0 if config.real_steps == 0 else config.collect.steps) if at_least is None else at_least
     progress.stage("collect", enough)
+    log = log or Unkept()
+    episodes = log.pending()
+    while sum(len(e.rewards) for e in episodes) < enough:
+        number = len(episodes) + left_out(log)
+        try:
+            with naming("collect", state.iteration + 1):
+                _play(config, state, number, episodes, enough, log, progress)
+        except EpisodeError as error:
+            _note_failure(log, len(episodes) + left_out(log), error)
+    return episodes
+
+
+def _play(
+    config: Config, state: State, first: int, episodes: list[Episode], enough: int, log: Log, progress: Progress
+) -> None:
+    """Adds episodes number `first` and following to `episodes` until these have `enough` steps."""
     inputs = _inputs(config, task_for(config), state.dataset)
     mean = partial(
         _perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise, inputs=inputs
     )
     explorer = lambda rng: real.explore(mean(rng), config.collect, rng)  # noqa: E731
-    episodes = [] if log is None else log.pending()
-    steps = sum(len(e.rewards) for e in episodes)
     # Each episode has randomness of its own, so that it is the same one after any interruption.
-    numbers = itertools.count(len(episodes))
-    rngs = (rng_of(config.seed, state.iteration + 1, Stage.COLLECT, number) for number in numbers)
-    with naming("collect", state.iteration + 1), closing(real.play(task_for(config), explorer, rngs)) as played:
+    rngs = (rng_of(config.seed, state.iteration + 1, Stage.COLLECT, number) for number in itertools.count(first))
+    steps, longest = sum(len(e.rewards) for e in episodes), config.collect.steps
+    with closing(real.play(task_for(config), explorer, rngs, longest, progress.played)) as played:
         while steps < enough:
             episodes.append(next(played))
-            if log is not None:
-                log.append(episodes[-1])
+            log.append(episodes[-1])
             steps += len(episodes[-1].rewards)
             progress.update(steps)
-    return episodes
+
+
+def _note_failure(log: Log, number: int, error: EpisodeError) -> None:
+    """Leaves an episode out, or raises its `error`: what was not the seed's fault may go better next time."""
+    failures = dict(log.failures())
+    hopeless = isinstance(error, NotFiniteError) or number in failures
+    failures[number] = hopeless
+    log.note_failures(failures)
+    if not hopeless:
+        raise error
+    real.leave_out(sum(failures.values()), error)
 
 
 def learn(
-    config: Config, state: State, episodes: list[Episode], progress: Progress = SILENT, clock: Clock | None = None
+    config: Config,
+    state: State,
+    episodes: list[Episode],
+    progress: Progress = SILENT,
+    clock: Clock | None = None,
+    failed: int = 0,
 ) -> tuple[State, Row]:
-    """The rest of an outer iteration: what `episodes`, and all before them, teach.
+    """The rest of an outer iteration: what `episodes`, and all before them, teach; `failed` others were left out.
 
-    Raises `DivergedError` where that is not finite and cannot be recovered.
+    What only records (diagnostics, evaluation) cannot fail: it is NaN then, with a warning.
+
+    Raises `DivergedError` where what is learned is not finite and cannot be recovered.
     """
     task = task_for(config)
     iteration = state.iteration + 1
@@ -172,13 +243,7 @@ def learn(
         policy, baseline, improved = _improve(config, task, state, dataset, ensemble, iteration, progress, clock)
         advice = "the run was resumed from, or became, a state that cannot go on: use smaller steps or start anew"
         require_finite("improve", iteration, advice, policy=policy, baseline=baseline)
-    with clock("evaluate"), naming("evaluate", iteration):
-        horizon = phase.imagined_horizon(config, task)
-        key = key_of(config.seed, iteration, Stage.DIAGNOSE)
-        diagnosis = diagnose(ensemble, policy, dataset.validation, dataset.train, horizon, key)
-        progress.stage("evaluate", config.evaluation_episodes)
-        returns = evaluate(config, task, policy, iteration)
-    state = State(
+    following = State(
         iteration=iteration,
         real_steps=state.real_steps + sum(len(e.rewards) for e in episodes),
         policy=policy,
@@ -187,13 +252,56 @@ def learn(
         baseline=baseline,
         dataset=dataset,
     )
+    with clock("evaluate"):
+        diagnosis = _diagnosis(config, task, following, ensemble)
+        progress.stage("evaluate", config.evaluation_episodes)
+        returns = recorded_returns(config, task, policy, iteration)
+        trust = _end_calibration(task, dataset, ensemble, iteration)
     collected = float(np.mean([e.rewards.sum() for e in episodes])) if episodes else math.nan
-    row = _row(config, state, returns, collected, fitted, improved, phase.is_cut(config, task))
+    row = _row(config, following, returns, collected, fitted, improved, phase.is_cut(config, task))
+    row |= {"failed_episodes": failed}
     row |= diagnosis.row() | {f"improved_{k}": float(share) for k, share in enumerate(improved.improved)}
-    if "end" in task.learned:
-        trust = end_calibration(ensemble, dataset.validation)
-        row |= {f"end_{name}": value for name, value in trust._asdict().items()}
-    return state, row | clock.row()
+    return following, row | trust | clock.row()
+
+
+def recorded(what: str, iteration: int, record: Callable[[], T], failed: T) -> T:
+    """What `record()` gives; where it fails, `failed` and a warning that says why: no record may cost what is learned.
+
+    Not so when the run is to stop (`run.interrupt.Stopped`).
+    """
+    try:
+        return record()
+    except Exception as error:
+        why = str(error) if isinstance(error, MetrpoError) else f"{type(error).__name__}: {error}"
+        _log.warning("iteration %d has no %s (%s); what it has learned is kept", iteration, what, why)
+        return failed
+
+
+def recorded_returns(
+    config: Config, task: Task, policy: Policy, iteration: int, stage: Stage = Stage.EVALUATE
+) -> np.ndarray:
+    """As `evaluate`; one NaN where that fails."""
+
+    def returns() -> np.ndarray:
+        with naming("evaluate" if stage is Stage.EVALUATE else "validate", iteration):
+            return evaluate(config, task, policy, iteration, stage)
+
+    return recorded("return_real", iteration, returns, np.array([math.nan]))
+
+
+def _diagnosis(config: Config, task: Task, state: State, ensemble: Ensemble) -> Diagnosis:
+    dataset, horizon = state.dataset, phase.imagined_horizon(config, task)
+    key = key_of(config.seed, state.iteration, Stage.DIAGNOSE)
+    record = partial(diagnose, ensemble, state.policy, dataset.validation, dataset.train, horizon, key)
+    return recorded("diagnostics", state.iteration, record, unknown(task.state_size, horizon))
+
+
+def _end_calibration(task: Task, dataset: Dataset, ensemble: Ensemble, iteration: int) -> Row:
+    if "end" not in task.learned:
+        return {}
+    nothing = Calibration(*[math.nan] * len(Calibration._fields))
+    trust = recorded("calibration", iteration, partial(end_calibration, ensemble, dataset.validation), nothing)
+    return {f"end_{name}": value for name, value in trust._asdict().items()}
 
 
 def _fit(
@@ -251,9 +359,9 @@ def _improve(
             starts = real.reset_states(task, max(config.validate.starts, phase.rollouts(config, task)), rng)
 
     def oracle(policy: Policy) -> float:
-        with naming("validate", iteration):
-            # Its starts are others than the record's, which would else be a selected maximum.
-            return float(np.mean(evaluate(config, task, policy, iteration, Stage.ORACLE)))
+        # A policy in which the environment fails is no improvement, and the next iteration has other starts. They are
+        # others than the record's, which would else be a selected maximum.
+        return float(np.mean(recorded_returns(config, task, policy, iteration, Stage.ORACLE)))
 
     return phase.improve(
         config,
@@ -297,12 +405,13 @@ def task_for(config: Config) -> Task:
 def evaluate(config: Config, task: Task, policy: Policy, iteration: int, stage: Stage = Stage.EVALUATE) -> np.ndarray:
     """Real returns [config.evaluation_episodes] of the deterministic policy: a record, never used to learn.
 
-    One NaN for a task that only another program can play.
+    Fewer where they have `EVALUATION_STEPS` together. One NaN for a task that only another program can play.
     """
     if not task.playable:
         return np.array([math.nan])
     seed = int(rng_of(config.seed, iteration, stage).integers(2**31))
-    return real.evaluate(task, partial(gaussian.mean, _host(policy)), config.evaluation_episodes, seed)
+    act = partial(gaussian.mean, _host(policy))
+    return real.evaluate(task, act, config.evaluation_episodes, seed, EVALUATION_STEPS)
 
 
 def _perturbed(

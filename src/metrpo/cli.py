@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from metrpo.config import Config
-from metrpo.errors import MetrpoError, TaskError
+from metrpo.errors import EpisodeError, MetrpoError, RunDirectoryError
 from metrpo.options import (
     Bench,
     Collect,
@@ -100,8 +100,9 @@ def _attended(run_dir: Path, shown: Progress, keeps_episodes: bool = True) -> It
         try:
             yield progress
         except (Stopped, KeyboardInterrupt, MetrpoError) as error:
-            begun = any(run_dir.glob("checkpoints/*.npz")) or any(run_dir.glob("episodes/*.npz"))
-            if isinstance(error, Stopped) or progress.began or (begun and isinstance(error, TaskError)):
+            # What else goes wrong (a file that is missing, a policy that diverged) would do so again.
+            may_go_on = isinstance(error, KeyboardInterrupt | EpisodeError | RunDirectoryError)
+            if isinstance(error, Stopped) or (progress.began and may_go_on):
                 error.add_note(f"{run_dir} keeps every finished iteration and real episode. The same command goes on.")
             raise
         finally:

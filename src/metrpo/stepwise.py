@@ -55,7 +55,7 @@ def collect(
     `collect.steps`), or reads a log (see `world.logged`) and adds what does not wait yet. `task` says where the run's
     task is, if its file has moved.
 
-    Raises `RunDirectoryError` when `run_dir` holds no run.
+    Raises `RunDirectoryError` when `run_dir` holds no run, `TaskError` when the task has no environment to play.
     """
     config = stored_config(run_dir)
     task_file.task_of_run(run_dir, config.task, task)
@@ -69,6 +69,7 @@ def collect(
                 else:
                     run.episodes.append(episode)
             return run.episodes.pending()
+        algorithm.task_for(config).require_playable()
         wanted = config.collect.steps if at_least is None else at_least
         progress.begin(state.iteration + 1, None)
         try:
@@ -95,7 +96,8 @@ def improve(run_dir: str | Path, progress: Progress = SILENT, task: str | None =
             )
         progress.begin(state.iteration + 1, None)
         try:
-            written = run.save(*algorithm.learn(config, state, episodes, progress))
+            failed = algorithm.left_out(run.episodes)
+            written = run.save(*algorithm.learn(config, state, episodes, progress, None, failed))
             progress.end(written, None)
         finally:
             progress.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import types
 from functools import cache, partial
 
@@ -142,13 +143,13 @@ PLACES = [("observation", None), ("observation", 0), ("observation", 17), ("rewa
 
 @pytest.mark.parametrize("value", [*POISON, 1e39, -3e38])
 @pytest.mark.parametrize(("what", "at"), PLACES)
-def test_a_sick_environment_is_named_with_stage_iteration_and_step(clean, monkeypatch, what, at, value):
+def test_a_sick_environment_is_named_with_stage_iteration_and_step(clean, monkeypatch, caplog, what, at, value):
     """1e39 is infinite in float32; from -3e38 to 3e38 it is farther than float32 reaches."""
     where = r"reset\(\)" if at is None else f"step {at} of an episode"
     message = f"iteration 2: Probe: {where}: expected finite numbers below 1.7e38 as {what}, got"
     Sick(monkeypatch, what, at, value, episode=2)
-    with pytest.raises(TaskError, match=f"^collect, {message}"):
-        algorithm.collect(TINY, clean.states[0])
+    assert len(algorithm.collect(TINY, clean.states[0])) == 4, "it is left out, and another one played"
+    assert re.match(f"collect, {message}", caplog.messages[0])
     Sick(monkeypatch, what, at, value, episode=1)
     with pytest.raises(TaskError, match=f"^evaluate, {message}"), finite.naming("evaluate", 2):
         algorithm.evaluate(TINY, probe.PROBE, clean.states[0].policy, 2)
@@ -179,29 +180,31 @@ def test_a_guarded_environment_is_held_to_the_same(monkeypatch, what, at, value)
         ("reward", 0, -math.inf, 11, "evaluate"),
     ],
 )
-def test_the_run_stays_at_its_last_iteration_and_goes_on_to_the_same_bytes(
-    clean, tmp_path, what, at, value, episode, stage
-):
+def test_the_run_goes_on_without_what_was_sick(clean, tmp_path, caplog, what, at, value, episode, stage):
     episode += 2 if stage == "collect" and episode < 6 else 0
     with pytest.MonkeyPatch.context() as patch:
         Sick(patch, what, at, value, episode)
-        with pytest.raises(TaskError, match=f"^{stage}, iteration 2: "):
-            train(TINY, tmp_path)
-    assert iterations_on_disk(tmp_path) == 1
-    assert len(read_metrics(tmp_path / "metrics.csv")) == 1
-    train(TINY, tmp_path)
-    assert content(tmp_path) == content(clean.path)
+        train(TINY, tmp_path)
+    assert f"{stage}, iteration 2: " in caplog.text
+    assert iterations_on_disk(tmp_path) == 3
+    rows, expected = (read_metrics(path / "metrics.csv") for path in (tmp_path, clean.path))
+    assert [row["failed_episodes"] for row in rows] == [0, int(stage == "collect"), 0]
+    if stage == "evaluate":
+        assert math.isnan(rows[1]["return_real"])
+        assert str([rows[0], rows[2]]) == str([expected[0], expected[2]]), "a record, and no more"
+        assert content(tmp_path)["policy.npz"] == content(clean.path)["policy.npz"]
 
 
 @pytest.mark.parametrize("stage", ["improve", "validate"])
-def test_resets_and_oracles_within_the_policy_phase_name_their_stage(clean, monkeypatch, stage):
+def test_resets_and_oracles_within_the_policy_phase_name_their_stage(clean, monkeypatch, caplog, stage):
+    """A reset is drawn again; a policy that cannot be judged is no improvement."""
     settings = {"imagine.start": "reset"} if stage == "improve" else {"validate.rule": "real"}
     Sick(monkeypatch, "observation", None, math.nan)
-    state, (ensemble, _) = clean.states[0], clean.fits[1]
-    with pytest.raises(TaskError, match=f"^{stage}, iteration 2: Probe: reset"):
-        algorithm._improve(
-            override(TINY, settings), probe.PROBE, state, state.dataset, ensemble, 2, SILENT, algorithm.Clock()
-        )
+    policy, _, _ = in_imagination(clean, clean.fits[1][0], settings)
+    assert sound(policy)
+    assert caplog.messages[0].startswith(
+        "Probe: reset" if stage == "improve" else "iteration 2 has no return_real (val"
+    )
 
 
 # ---------------------------------------------------------------- what a state holds

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from metrpo.algorithm import Row, evaluate
+from metrpo.algorithm import Row, recorded_returns
 from metrpo.baselines import on_policy
 from metrpo.baselines.on_policy import Drawn
 from metrpo.config import Config
@@ -52,7 +52,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
     with clock("collect"):
         progress.stage("collect", config.collect.steps)
         rng = rng_of(config.seed, iteration, Stage.COLLECT)
-        drawn = on_policy.collect(task, state.policy, config.collect.steps, rng, progress.update)
+        drawn = on_policy.collect(task, state.policy, config.collect.steps, rng, progress.update, config.collect.steps)
     with clock("improve"):
         progress.stage("improve")
         # Other settings, the seed say, must not cause a compilation.
@@ -62,7 +62,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
         policy, baseline, info = jax.device_get(_update(relevant, state.policy, state.baseline, batch, key))
     with clock("evaluate"):
         progress.stage("evaluate", config.evaluation_episodes)
-        returns = evaluate(config, task, policy, iteration)
+        returns = recorded_returns(config, task, policy, iteration)
     steps = state.real_steps + sum(len(e.rewards) for e in drawn.episodes)
     row = {
         "iteration": iteration,

@@ -28,14 +28,15 @@ def collect(
     at_least: int,
     rng: np.random.Generator,
     on_episode: real.OnEpisode = lambda steps: None,
+    longest: int | None = None,
 ) -> Drawn:
     """Whole episodes of `at_least` steps together, acting by samples of `policy` (see `world.collect.collect`)."""
     host = jax.tree.map(np.asarray, policy)
-    std, drawn = np.exp(host.log_std), []
+    std, drawn, actions = np.exp(host.log_std), list[list[np.ndarray]](), list[np.ndarray]()
 
     def draw_act(rng: np.random.Generator) -> real.Act:
-        actions: list[np.ndarray] = []
-        drawn.append(actions)
+        nonlocal actions
+        actions = []
 
         def act(state: np.ndarray) -> np.ndarray:
             actions.append(gaussian.mean(host, state) + std * rng.standard_normal(len(std)))
@@ -43,5 +44,9 @@ def collect(
 
         return act
 
-    episodes = real.collect(task, draw_act, at_least, rng, on_episode)
+    def keep(steps: int) -> None:  # an episode that fails is left out
+        drawn.append(actions)
+        on_episode(steps)
+
+    episodes = real.collect(task, draw_act, at_least, rng, keep, longest)
     return Drawn(episodes, [np.array(actions, np.float32) for actions in drawn])

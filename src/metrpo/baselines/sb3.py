@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.wrappers import TransformObservation
 
-from metrpo.algorithm import Row, evaluate
+from metrpo.algorithm import Row, recorded_returns
 from metrpo.config import Config
 from metrpo.errors import MetrpoError
 from metrpo.policy.gaussian import Policy
@@ -24,6 +24,7 @@ from metrpo.run.clock import Clock
 from metrpo.run.progress import SILENT, Progress
 from metrpo.seeds import Stage, rng_of
 from metrpo.world.registry import get_task
+from metrpo.world.returned import closing
 
 try:
     import torch
@@ -80,14 +81,14 @@ def init(config: Config) -> State:
 
     Raises `TaskError` for an unknown task.
     """
-    with closing(_environment(config)) as env:
+    with closing(_environment(config), config.task) as env:
         return _state(config, _model(config, env, _seed(config, 0, Stage.INIT), None), 0)
 
 
 def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
     """One outer iteration: learning for `collect.steps` real steps, rounded up to whole updates of the algorithm."""
     iteration, clock = state.iteration + 1, Clock()
-    with closing(_environment(config)) as env, clock("improve"):
+    with closing(_environment(config), config.task) as env, clock("improve"):
         progress.stage("learn", config.collect.steps)
         model = _model(config, env, _seed(config, iteration, Stage.COLLECT), state)
         watch = _Watch(state.real_steps, clock, progress)
@@ -96,7 +97,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
         state = _state(config, model, iteration)
     with clock("evaluate"):
         progress.stage("evaluate", config.evaluation_episodes)
-        returns = evaluate(config, get_task(config.task), state.policy, iteration)
+        returns = recorded_returns(config, get_task(config.task), state.policy, iteration)
     return state, {
         "iteration": state.iteration,
         "real_steps": state.real_steps,

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from metrpo.algorithm import Row, evaluate, task_for
+from metrpo.algorithm import Row, recorded_returns, task_for
 from metrpo.baselines import on_policy
 from metrpo.config import Config
 from metrpo.errors import ConfigError
@@ -96,7 +96,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
     progress.stage("learn", config.collect.steps)
     while (steps := sum(len(e.rewards) for e in collected)) < config.collect.steps:
         with clock("collect"):
-            drawn = on_policy.collect(task, state.policy, 1, rng)
+            drawn = on_policy.collect(task, state.policy, 1, rng, longest=config.collect.steps)
             collected += drawn.episodes
             state = state._replace(replay=datasets.append(state.replay, drawn.episodes, config.collect.max_train))
             path = _path(drawn.episodes[0].states, drawn.actions[0], drawn.episodes[0].rewards, task.horizon)
@@ -114,7 +114,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
     steps = sum(len(e.rewards) for e in collected)
     with clock("evaluate"):
         progress.stage("evaluate", config.evaluation_episodes)
-        returns = evaluate(config, task, state.policy, iteration)
+        returns = recorded_returns(config, task, state.policy, iteration)
     state = state._replace(iteration=iteration, real_steps=state.real_steps + steps)
     row = {
         "iteration": iteration,

@@ -6,6 +6,7 @@ who asks why a run does not learn.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -53,6 +54,17 @@ class Diagnosis(NamedTuple):
         return overall | rest | each
 
 
+def unknown(state_size: int, horizon: int) -> Diagnosis:
+    """A diagnosis that could not be made, of NaN; its columns are those of one that was."""
+    errors = {k: np.full(state_size, np.nan) for k in _steps(horizon)}
+    return Diagnosis(errors, **dict.fromkeys(Diagnosis._fields[1:], math.nan))
+
+
+def _steps(horizon: int) -> list[int]:
+    length = min(horizon, _LONGEST)
+    return [k for k in HORIZONS if k < length] + [length]
+
+
 def diagnose(
     ensemble: Ensemble, policy: Policy, held_out: Transitions, train: Transitions, horizon: int, key: Array
 ) -> Diagnosis:
@@ -71,7 +83,7 @@ def diagnose(
     predicted, spread, imagined, guessed, beyond = jax.device_get(_rollouts(*on_host, starts, actions, key))
     after = np.asarray(held_out.states) + np.asarray(held_out.deltas)[:, :size]
     errors = {}
-    for k in [k for k in HORIZONS if k < length] + [length]:
+    for k in _steps(horizon):
         there = steps >= k
         ends = after[np.minimum(rows + k - 1, len(after) - 1)][there]
         errors[k] = _relative(predicted[k - 1][:, there], starts[there], ends)

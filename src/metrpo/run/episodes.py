@@ -1,6 +1,7 @@
 """Real episodes on disk from the moment they end: what a run has collected and not yet learned from.
 
     DIR/episodes/00000012.npz    the thirteenth episode of the run: states, actions, rewards, terminated
+    DIR/episodes/failed.json     episodes of the iteration under way in which the environment failed
 
 Episodes are numbered over the whole run, whoever appends them: the loop, or a robot's own program (`append_episode`).
 The checkpoint of an iteration says how many it has learned from; their files go once no kept checkpoint needs them.
@@ -9,21 +10,22 @@ The checkpoint of an iteration says how many it has learned from; their files go
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import os
 import re
 import secrets
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from metrpo.errors import RunDirectoryError, TaskError
-from metrpo.run.files import read_arrays, sync_directory, write_arrays, writing
+from metrpo.run.files import atomic_write, read_arrays, sync_directory, write_arrays, writing
 from metrpo.run.policy_file import load_policy
 from metrpo.types import Episode
-from metrpo.untrusted import brief
+from metrpo.untrusted import brief, json_of, text_of
 
 _log = logging.getLogger("metrpo")
 
@@ -34,6 +36,7 @@ class EpisodeLog:
     def __init__(self, run_dir: Path, writer: str | None = None) -> None:
         # The name of the only writer there is may come again, over what a kill has left; others are never the same.
         self._folder, self._writer = run_dir / "episodes", writer or f"{os.getpid()}-{secrets.token_hex(4)}"
+        self._failed = self._folder / "failed.json"
         self.widths: tuple[int, int] | None = None
         """How many numbers a state and an action of this run have, where that is known."""
         self.start(after=0)
@@ -44,6 +47,28 @@ class EpisodeLog:
         """Number of the first episode that may be pending."""
         self.read = after
         """Number after the last episode that `pending` gave or `append` wrote."""
+
+    def failures(self) -> dict[int, bool]:
+        """The episodes since the state learned in which the environment failed, and whether each is left out for good.
+
+        By their number within the iteration. What cannot be read says nothing: such an episode fails once more.
+        """
+        return self._failures().get(self.taken, {})
+
+    def note_failures(self, failures: Mapping[int, bool]) -> None:
+        """Puts them on disk. Raises `RunDirectoryError` when it cannot be written."""
+        # With those of the iteration before, which a damaged checkpoint may lead back to.
+        kept = {after: each for after, each in self._failures().items() if after < self.taken}
+        kept = dict(sorted(kept.items())[-1:]) | {self.taken: dict(failures)}
+        atomic_write(self._failed, json.dumps(kept) + "\n")
+
+    def _failures(self) -> dict[int, dict[int, bool]]:
+        try:
+            stored = json_of(text_of(self._failed, RunDirectoryError), str(self._failed), RunDirectoryError)
+            found = {int(after): {int(n): left_out for n, left_out in each.items()} for after, each in stored.items()}
+        except (RunDirectoryError, AttributeError, ValueError):
+            return {}
+        return {after: each for after, each in found.items() if all(type(x) is bool for x in each.values())}
 
     def pending(self) -> list[Episode]:
         """The episodes that the state has not learned from, in order.

@@ -19,6 +19,7 @@ from metrpo.seeing.concern import Concern
 CHECKS: tuple[Callable[[Sequence[Row], Config], Concern | None], ...] = (
     model_signs.not_finite,
     model_signs.model_exploited,
+    policy_signs.not_evaluated,
     policy_signs.return_fell,
     policy_signs.no_improvement,
     model_signs.diverged,
@@ -32,6 +33,7 @@ CHECKS: tuple[Callable[[Sequence[Row], Config], Concern | None], ...] = (
     policy_signs.nothing_accepted,
     model_signs.end_untrusted,
     policy_signs.few_episodes,
+    policy_signs.failed_episodes,
 )
 """Extend them by adding a row."""
 

@@ -128,10 +128,8 @@ def loss_rises(rows: Sequence[Row], config: Config) -> Concern | None:
 
 
 def not_finite(rows: Sequence[Row], config: Config) -> Concern | None:
-    """What should be a number is none. A return without an environment is none by right."""
+    """What should be a number is none."""
     names = [n for n in rows[0] if n.startswith("validation_loss_") or n in ("return_imagined", "train_loss", "kl")]
-    if np.isfinite(column(rows, "return_real")).any():
-        names.append("return_real")
     # An empty cell is what a method does not measure.
     bad = [[n for n in names if row.get(n) is not None and not math.isfinite(row[n] or 0.0)] for row in rows]
     since = since_when(rows, np.array([bool(b) for b in bad]))

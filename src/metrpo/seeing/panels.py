@@ -35,6 +35,7 @@ _QUANTITIES = (
     ("disagreement_imagined", "Disagreement", "of the models in imagination, in standard deviations", False),
     ("outside", "Outside the data", "share of the imagined states beyond the real ones' range", True),
     ("members_reset", "Models started anew", "in each iteration, having diverged", True),
+    ("failed_episodes", "Episodes left out", "in which the environment failed", True),
     ("return_collected", "Collected return", "of the real episodes, with exploration noise", False),
     ("train_loss", "Training loss", "mean over the models", True),
     ("fit_passes", "Passes of fitting", "over the training set", True),

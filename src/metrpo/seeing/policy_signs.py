@@ -57,6 +57,38 @@ def return_fell(rows: Sequence[Row], config: Config) -> Concern | None:
     )
 
 
+def not_evaluated(rows: Sequence[Row], config: Config) -> Concern | None:
+    """The evaluation fails. Without an environment there is none, by right."""
+    real = column(rows, "return_real")
+    since = since_when(rows, ~np.isfinite(real))
+    if since is None or not np.isfinite(real).any():
+        return None
+    return Concern(
+        "not-evaluated",
+        "warning",
+        since,
+        "No real return",
+        "the environment failed in the policy's evaluation, or gave rewards that are not finite; learning goes on",
+        "metrpo evaluate DIR says where; end an episode before the simulation diverges",
+    )
+
+
+def failed_episodes(rows: Sequence[Row], config: Config) -> Concern | None:
+    """The environment fails in some episodes, of which nothing is learned."""
+    failed = column(rows, "failed_episodes")
+    if not np.nansum(failed):
+        return None
+    first = int(np.flatnonzero(np.nan_to_num(failed))[0])
+    return Concern(
+        "failed-episodes",
+        "note",
+        int(iteration_at(rows, first)),
+        f"{int(np.nansum(failed))} real episodes left out",
+        "the environment failed in them (NaN, infinity, an exception), so that nothing is learned from where it does",
+        "end an episode before the simulation diverges, or repair the environment",
+    )
+
+
 def no_improvement(rows: Sequence[Row], config: Config) -> Concern | None:
     """Nothing after the first iteration is better than it."""
     real, error = column(rows, "return_real"), standard_error(rows, config)
