@@ -147,7 +147,16 @@ IMPOSSIBLE = {
     "validate.max_updates": [0],
     "validate.starts": [0],
 }
-FREE = {"preset", "improver", "deterministic", "collect.std_per", "fit.loss_units", "imagine.sampling", "imagine.start"}
+FREE = {
+    "preset",
+    "improver",
+    "deterministic",
+    "collect.std_per",
+    "fit.loss_units",
+    "imagine.sampling",
+    "imagine.start",
+    "policy.normalise",
+}
 FREE |= {
     "validate.rule",
     "fit.products",
