@@ -256,7 +256,7 @@ def test_an_environment_that_cannot_be_closed_costs_a_warning(caplog, tmp_path):
     assert [r.getMessage() for r in caplog.records] == [text] * 4
     with pytest.raises(ValueError, match="policy failed"):  # what happened first is what is said
         real.evaluate(task, _failing, 2, seed=0)
-    with pytest.raises(VideoError, match="cannot render here"):
+    with pytest.raises(VideoError, match="the environment has no render"):
         evaluation.record(task.make_env, act, tmp_path / "out.gif")
 
 
