@@ -502,6 +502,17 @@ def test_parameter_noise_does_not_know_the_units_of_the_states(offset, scale):
     np.testing.assert_allclose(actions(other, offset + scale * rows), actions(plain, rows), atol=0.05)
 
 
+def test_the_standard_deviation_goes_on_where_the_config_has_a_least_one(tiny, monkeypatch):
+    script = Script(monkeypatch, tiny, all_models([10]))
+    goes_on = override(script.config, {"policy.min_std": 0.2})
+    script.state = script.state._replace(policy=script.state.policy._replace(log_std=np.float32([-1.0, -3.0])))
+    accepted, _, _ = script.run(goes_on)
+    np.testing.assert_allclose(accepted.log_std, np.float32([-1.0, np.log(0.2)]) - 10, rtol=1e-6)
+    script.state = script.state._replace(iteration=0)
+    accepted, _, _ = script.run(goes_on)
+    np.testing.assert_allclose(accepted.log_std, np.log(TINY.policy.initial_std) - 10, err_msg="but not into the first")
+
+
 def test_the_standard_deviation_is_set_back_at_the_start_of_the_phase(tiny, monkeypatch):
     script = Script(monkeypatch, tiny, all_models([10]))
     np.testing.assert_allclose(script.accepted.log_std, np.log(TINY.policy.initial_std) - 10)

@@ -119,6 +119,7 @@ IMPOSSIBLE = {
     "imagine.disagreement": [-1.0, float("nan"), float("inf")],
     "policy.hidden": [(0,)],
     "policy.initial_std": [0.0, -1.0, float("nan")],
+    "policy.min_std": [-0.1, float("inf"), float("nan")],
     "policy.mean_penalty": [-0.1, float("inf"), float("nan")],
     "advantage.discount": [-0.1, 1.1, float("nan")],
     "advantage.gae_lambda": [-0.1, 1.1, float("nan")],

@@ -99,6 +99,7 @@ OURS = {
     "advantage.value_batch_size": (1000, "of the network that the paper does not have"),
     "advantage.value_learning_rate": (1e-3, "of the network that the paper does not have"),
     "policy.normalise": (False, "code: the policy sees the full, unnormalised state"),
+    "policy.min_std": (0.0, "A.1.3: the std is reset at every phase (code)"),
     "policy.mean_penalty": (0.0, "the paper knows none: off"),
     "imagine.disagreement": (0.0, "the paper's future work: off"),
     "trust_reward": (False, "the paper's tasks are our own"),

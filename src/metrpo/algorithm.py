@@ -367,7 +367,7 @@ def _improve(
         config,
         task,
         ensemble,
-        gaussian.reset_std(state.policy, config.policy.initial_std),
+        _with_std(config, state),
         state.baseline,
         starts,
         rng,
@@ -383,6 +383,14 @@ def _inputs(config: Config, task: Task, dataset: Dataset) -> Inputs | None:
     """What the policy sees of a state; None: all of it, as it is."""
     seen = config.policy.normalise and dataset.train.size > 0
     return inputs_of(dataset.train.states, task.unseen) if seen else None
+
+
+def _with_std(config: Config, state: State) -> Policy:
+    """The policy with the standard deviation that a phase starts from."""
+    if config.policy.min_std and state.iteration > 0:
+        least = np.float32(math.log(config.policy.min_std))
+        return state.policy._replace(log_std=np.maximum(np.asarray(state.policy.log_std), least))
+    return gaussian.reset_std(state.policy, config.policy.initial_std)
 
 
 def _logged(config: Config, task: Task) -> Dataset:

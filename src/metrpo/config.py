@@ -150,12 +150,16 @@ class PolicyConfig:
     """Standard deviation at the start of every policy phase."""
     normalise: bool = False
     """Let the policy see states normalised by the dataset, and not the dimensions that the models do not see."""
+    min_std: float = 0.0
+    """Above 0: the standard deviation goes on from phase to phase and is at least this where one starts; 0: every phase
+    starts from initial_std (the paper)."""
     mean_penalty: float = 0.0
     """Taken from the surrogate of trpo, ppo and vpg: this times the squared excess of mean actions beyond [-1, 1]."""
 
     def __post_init__(self) -> None:
         _require(all(n >= 1 for n in self.hidden), "policy.hidden", self.hidden, "sizes of at least 1")
         _require(_positive(self.initial_std), "policy.initial_std", self.initial_std, "a finite number > 0")
+        _require(_nonnegative(self.min_std), "policy.min_std", self.min_std, "a finite number >= 0")
         _require(_nonnegative(self.mean_penalty), "policy.mean_penalty", self.mean_penalty, "a finite number >= 0")
 
 
@@ -386,6 +390,7 @@ BUDGET_FIELDS = ("iterations", "real_steps")
 ADDED = (
     "config.fit.products",
     "config.policy.normalise",
+    "config.policy.min_std",
     "config.policy.mean_penalty",
     "config.imagine.horizon",
     "config.imagine.products",
