@@ -11,6 +11,7 @@ import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,11 +19,14 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from helpers import random_policy
 from metrpo.errors import MetrpoError, RunDirectoryError
 from metrpo.policy import gaussian
 from metrpo.run.export import export
 from metrpo.run.files import read_arrays, write_arrays
 from metrpo.run.policy_file import PolicyInfo, load_policy, save_policy
+from metrpo.world.interface import Interface
+from metrpo.world.registry import get_task
 
 S, A = 11, 3
 HOSTILE = [
@@ -40,10 +44,10 @@ HOSTILE = [
 ]
 
 
-def saved(directory, hidden=(8,), scale=1.0, task="Swimmer"):
+def saved(directory, hidden=(8,), scale=1.0, task="Swimmer", interface=None):
     policy = gaussian.init(jax.random.key(1), S, A, hidden, 1.0)
     policy = policy._replace(layers=tuple((scale * w, b + 0.1) for w, b in policy.layers))
-    save_policy(directory, policy, task, 3, 900, 12.5)
+    save_policy(directory, policy, task, 3, 900, 12.5, interface)
     return policy
 
 
@@ -131,6 +135,115 @@ def test_python_describes_itself(tmp_path):
     for fact in ("from policy import act", "S = 11, A = 3", "environment: Swimmer.", *origin.values(), "3 iterations"):
         assert fact in module.__doc__
     assert str(tmp_path) not in path.read_text()
+
+
+TO_ENV = {".py": lambda path: python(path).to_env, ".npz": lambda path: load_policy(path).to_env}
+
+
+@pytest.mark.parametrize("ending", TO_ENV)
+@pytest.mark.parametrize(
+    ("low", "high", "dtype"),
+    [((-2.0, -0.5, 1.0), (2.0, 3.0, 5.0), np.float32), ((-2.7, 0.1, -1e9), (2.4, 0.3, 1e9), np.float64)],
+)
+def test_actions_in_the_environments_units_are_those_of_the_wrapper(ending, low, high, dtype, tmp_path):
+    saved(tmp_path, interface=Interface(((S, "all"),), low, high))
+    to_env = TO_ENV[ending](export(tmp_path, tmp_path / f"exported{ending}"))
+    actions = np.array([[-1, -1, -1], [1, 1, 1], [0, 0, 0], [0.25, -0.5, 2], [-7, 0.999, 1]], np.float32)
+    found = to_env(actions)
+    box = gymnasium.spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
+    assert found.dtype == dtype
+    assert all(box.contains(row) for row in found)
+    np.testing.assert_array_equal(found[:2], [box.low, box.high])
+    np.testing.assert_allclose(found[2], (np.array(low) + high) / 2, rtol=1e-6)
+    np.testing.assert_allclose(found[3], np.array(low) + np.array([0.625, 0.25, 1]) * (np.array(high) - low), rtol=1e-6)
+    np.testing.assert_array_equal(to_env(actions[3]), found[3])
+    for shape in [(), (A + 1,), (2, 2, A)]:
+        with pytest.raises(ValueError, match=r"action: expected shape \[3\] or \[B, 3\]"):
+            to_env(np.zeros(shape))
+
+
+@pytest.mark.parametrize("ending", TO_ENV)
+def test_a_policy_of_old_acts_and_says_that_it_knows_no_range(ending, ordinary, tmp_path):
+    arrays, meta = read_arrays(ordinary.with_name("policy.npz"))
+    old = {k: v for k, v in meta["policy"].items() if k not in ("observation", "action_low", "action_high")}
+    write_arrays(tmp_path / "policy.npz", arrays, {"policy": old})
+    path = export(tmp_path, tmp_path / f"exported{ending}")
+    observation = np.linspace(-1, 1, S)
+    np.testing.assert_array_equal(READERS[ending](path)(observation), load_policy(ordinary.parent)(observation))
+    with pytest.raises(ValueError, match="does not say its environment's range of actions"):
+        TO_ENV[ending](path)(np.zeros(A))
+    if ending == ".py":
+        assert "not known: scale the actions yourself" in python(path).__doc__
+
+
+def test_an_exported_policy_of_a_walker_plays_the_plain_environment(tmp_path):
+    """From what its file says alone: which number to put in front, and in which units to act."""
+    task = get_task("HalfCheetah-v5")
+    policy = random_policy(0, 18, 6)
+    save_policy(tmp_path, policy, task.name, 1, 1000, 1.0, task.interface)
+    module = python(export(tmp_path))
+    assert [size for size, _ in module.OBSERVATION] == [1, 17]
+    assert "global x, added by metrpo" in module.__doc__
+    plain, ours = gymnasium.make("HalfCheetah-v5"), task.make_env()
+    shown, state = plain.reset(seed=3)[0], ours.reset(seed=3)[0]
+    for _ in range(5):
+        observation = np.concatenate([[plain.unwrapped.data.qpos[0]], shown])
+        np.testing.assert_array_equal(observation, state)
+        shown = plain.step(module.control(observation))[0]
+        state = ours.step(load_policy(tmp_path)(state))[0]
+    plain.close()
+    ours.close()
+
+
+def test_the_pendulums_torque_is_that_of_the_environment(tmp_path):
+    task = get_task("Pendulum-v1")
+    save_policy(tmp_path, random_policy(0, 3, 1), task.name, 1, 1000, 1.0, task.interface)
+    module = python(export(tmp_path))
+    assert (module.ACTION_LOW, module.ACTION_HIGH) == ([-2.0], [2.0])
+    assert module.OBSERVATION == [[3, "the observation of Pendulum-v1"]]
+    beside = json.loads((tmp_path / "policy.json").read_text())
+    assert (beside["action_low"], beside["action_high"]) == ([-2.0], [2.0])
+    assert beside["observation"] == module.OBSERVATION
+    state = np.array([0.5, -0.5, 1.0])
+    np.testing.assert_allclose(module.control(state), 2 * module.act(state), rtol=1e-6)
+    assert module.control(np.zeros((4, 3))).shape == (4, 1)
+
+
+def test_onnx_says_the_layout_and_the_range_too(tmp_path):
+    onnx_package = pytest.importorskip("onnx")
+    saved(tmp_path, interface=Interface(((1, "height"), (S - 1, "the rest")), (-2.0,) * A, (3.0,) * A))
+    model = onnx_package.load(str(export(tmp_path, tmp_path / "p.onnx")))
+    said = {entry.key: entry.value for entry in model.metadata_props}
+    assert json.loads(said["observation"]) == [[1, "height"], [S - 1, "the rest"]]
+    assert (json.loads(said["action_low"]), json.loads(said["action_high"])) == ([-2.0] * A, [3.0] * A)
+
+
+@pytest.mark.parametrize("text", HOSTILE)
+def test_no_description_of_an_observation_becomes_code(text, tmp_path):
+    saved(tmp_path, interface=Interface(((S, text),), (-1.0,) * A, (1.0,) * A))
+    module = python(path := export(tmp_path))
+    assert path.read_bytes().isascii()
+    assert [[S, json.loads(json.dumps(text))]] == module.OBSERVATION
+    assert f"[0:{S}]  {module.OBSERVATION[0][1]}\n" in module.__doc__
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("observation", [[S - 1, "too few"]]),
+        ("observation", [[S, 3]]),
+        ("observation", [S]),
+        ("observation", "all"),
+        ("action_low", [0.0] * (A - 1)),
+        ("action_low", [float("nan")] * A),
+        ("action_high", [10**400] * A),
+        ("action_high", [True] * A),
+    ],
+)
+def test_a_layout_or_range_that_cannot_be_is_refused(name, value, ordinary, tmp_path):
+    rename(ordinary.with_name("policy.npz"), tmp_path, **{name: value})
+    with pytest.raises(RunDirectoryError, match=rf"policy\.npz: {name}: expected .* got"):
+        load_policy(tmp_path)
 
 
 def test_python_is_short_plain_and_the_same_every_time(tmp_path):
@@ -241,7 +354,7 @@ def test_no_other_field_becomes_code_either(ordinary, name, tmp_path):
         tmp_path,
         **{name: ['0"""\nimport os'] if name == "hidden" else '0"""\nimport os\nos.abort()\n"""'},
     )
-    if name in ("observation_size", "action_size", "hidden", "activation"):
+    if name not in ("task", "iteration", "real_steps", "return_real"):
         with pytest.raises(RunDirectoryError, match=r"policy\.npz: "):
             export(tmp_path)
     else:

@@ -1,5 +1,6 @@
 """A saved policy acts as the trained one did, in NumPy alone."""
 
+import dataclasses
 import hashlib
 import json
 import os
@@ -15,6 +16,7 @@ from metrpo.policy import gaussian
 from metrpo.run.directory import stored_config
 from metrpo.run.files import read_arrays, write_arrays
 from metrpo.run.policy_file import load_policy, save_policy
+from metrpo.world.interface import Interface
 
 S, A, HIDDEN = 5, 2, (8, 6)
 
@@ -47,6 +49,18 @@ def test_actions_are_clipped_and_repeatable(policy, tmp_path):
     actions = load_policy(tmp_path)(observations)
     assert np.abs(actions).max() == 1
     np.testing.assert_array_equal(actions, load_policy(tmp_path)(observations))
+
+
+def test_an_interface_of_other_sizes_is_left_out(policy, tmp_path):
+    fitting = Interface(((S, "all"),), (-1.0,) * A, (2.0,) * A)
+    save_policy(tmp_path, policy, "Swimmer", 3, 900, 12.5, fitting)
+    assert load_policy(tmp_path).info.action_high == (2.0,) * A
+    for other in (
+        dataclasses.replace(fitting, observation=((S - 1, "x"),)),
+        dataclasses.replace(fitting, action_low=()),
+    ):
+        save_policy(tmp_path, policy, "Swimmer", 3, 900, 12.5, other)
+        assert load_policy(tmp_path).info.action_high is None
 
 
 @pytest.mark.parametrize("shape", [(), (S + 1,), (4, S + 1), (2, 3, S), (S, 1)])

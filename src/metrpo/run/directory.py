@@ -28,7 +28,7 @@ import numpy as np
 
 from metrpo import config as configs
 from metrpo.config import Config
-from metrpo.errors import ConfigError, RunDirectoryError
+from metrpo.errors import ConfigError, RunDirectoryError, TaskError
 from metrpo.run import yardsticks
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.claim import claim, require_same
@@ -46,9 +46,10 @@ from metrpo.run.metrics import (
     to_csv,
     without_clocks,
 )
-from metrpo.run.policy_file import Weights, save_policy
+from metrpo.run.policy_file import Interface, Weights, save_policy
 from metrpo.run.report import draw_curve
 from metrpo.untrusted import text_of
+from metrpo.world.registry import get_task
 
 _log = logging.getLogger("metrpo")
 _KEPT = 2
@@ -222,7 +223,8 @@ class RunDirectory:
                 old.unlink()
         result = self.rows[-1].get("return_real") if self.rows else None
         result = result if result is not None and math.isfinite(result) else None
-        save_policy(self.path, state.policy, self.config.task, state.iteration, state.real_steps, result)
+        progress = (state.iteration, state.real_steps, result)
+        save_policy(self.path, state.policy, self.config.task, *progress, _interface(self.config.task))
         if not self.rows:
             return
         title = f"{self.config.task}, {self.config.system}, {self.config.preset}, seed {self.config.seed}"
@@ -268,6 +270,12 @@ def _within(seconds: float, act: Callable[[], None]) -> None:
         raise TimeoutError(f"not finished within {seconds:g} s")
     if raised:
         raise raised[0]
+
+
+def _interface(task: str) -> Interface | None:
+    with contextlib.suppress(TaskError):  # what is learned here need not be a task that this process knows
+        return get_task(task).interface
+    return None
 
 
 def _number(path: Path) -> int:

@@ -34,7 +34,8 @@ _OPSET = 13
 def export(run_dir: Path, out: Path | None = None) -> Path:
     """Writes a run's policy to `out` (.py, .onnx or .npz; default: `policy.py` in the run directory) and returns it.
 
-    All three map observations [B, S] to actions [B, A] in [-1, 1], as `load_policy` does; the .py also [S] to [A].
+    All three map observations [B, S] to actions [B, A] in [-1, 1], as `load_policy` does; the .py also [S] to [A], and
+    its `control` to the environment's own range. They say how observations are laid out, and that range.
 
     Raises `MetrpoError` for another ending, a name that Python cannot import, a .py file in the way that is not ours,
     or when the onnx package is missing, `RunDirectoryError` when there is no policy, it is damaged, or `out` cannot be
@@ -88,13 +89,42 @@ def _python(policy: LoadedPolicy, source: Path) -> str:
         "action_size": sizes[-1],
         "sizes": sizes,
         "task_literal": ascii(info["task"]),
-        "info_literal": "{\n" + "".join(f"    {name!a}: {value!a},\n" for name, value in info.items()) + "}",
+        "info_literal": "{\n" + "".join(f"    {name!a}: {_literal(value)},\n" for name, value in info.items()) + "}",
+        "layout": _layout(info["observation"]),
+        "range": _range(info),
         "sha256": hashlib.sha256(weights).hexdigest(),
         "weights": "\n".join(textwrap.wrap(base64.b64encode(weights).decode(), 100)),
         "example": _numbers(example),
         "action": _numbers(policy(example)),
     }
     return Template(_SOURCE).substitute(fields)
+
+
+def _literal(value: Any) -> str:
+    """A value as Python writes it, a list over several lines."""
+    if not isinstance(value, list) or not value:
+        return ascii(value)
+    if isinstance(value[0], list):
+        return "[\n" + "".join(f"        {part!a},\n" for part in value) + "    ]"
+    return textwrap.fill(str(value), 100, subsequent_indent=" " * 8, break_on_hyphens=False)
+
+
+def _layout(parts: list[tuple[int, str]] | None) -> str:
+    """The parts of an observation, a line each, for a docstring."""
+    if parts is None:
+        return "    not known: the policy says nothing of them"
+    lines, start = [], 0
+    for size, text in parts:
+        lines.append(f"    [{start}:{start + size}]  {_inside_docstring(text)}")
+        start += size
+    return "\n".join(lines)
+
+
+def _range(info: dict[str, Any]) -> str:
+    if info["action_low"] is None or info["action_high"] is None:
+        return "    not known: scale the actions yourself"
+    low, high = _literal(info["action_low"]), _literal(info["action_high"])
+    return f"    ACTION_LOW   {low}\n    ACTION_HIGH  {high}"
 
 
 def _inside_docstring(value: Any) -> str:
@@ -122,8 +152,9 @@ def _onnx(policy: LoadedPolicy, source: Path) -> bytes:
     def end(name: str, size: int, text: str) -> Any:
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size], doc_string=text)
 
-    observation = end("observation", len(policy.layers[0][0]), "What the task's environment shows.")
-    action = end("action", len(policy.layers[-1][1]), "What the task's environment takes, in [-1, 1]; without noise.")
+    observation = end("observation", len(policy.layers[0][0]), "Its parts in order: the metadata's observation.")
+    units = "In [-1, 1], without noise; the environment's range: the metadata's action_low and action_high."
+    action = end("action", len(policy.layers[-1][1]), units)
     tensors = [numpy_helper.from_array(array.astype(np.float32), name) for name, array in constants.items()]
     graph = helper.make_graph(nodes, "policy", [observation], [action], tensors, doc_string="A tanh network, clipped.")
     info = {name: _utf8(value) for name, value in _info(policy, source).items()}
@@ -145,10 +176,16 @@ _WRITERS: dict[str, _Writer] = {".py": _python, ".onnx": _onnx, ".npz": lambda _
 _SOURCE = '''\
 """A trained control policy in one file: observations in, actions out. It needs NumPy and nothing else.
 
-    from policy import act  # or whatever this file is called
+    from policy import act, control  # or whatever this file is called
     action = act(observation)  # [S] -> [A] or [B, S] -> [B, A], float32, each action in [-1, 1]
+    action = control(observation)  # the same in the environment's own units, within its bounds
 
-S = $observation_size, A = $action_size; the observations and actions are those of the task's environment: $task.
+S = $observation_size, A = $action_size; made in the task's environment: $task.
+Its observations, which may hold more than the plain environment shows:
+$layout
+Its own range of actions, for which -1 and 1 stand:
+$range
+
 Written by metrpo $metrpo from a policy.npz with SHA-256
 $policy_sha256,
 trained for $iteration iterations on $real_steps real steps. Run this file to check it.
@@ -163,6 +200,9 @@ OBSERVATION_SIZE = $observation_size
 ACTION_SIZE = $action_size
 TASK = $task_literal
 INFO = $info_literal
+OBSERVATION = INFO["observation"]
+ACTION_LOW = INFO["action_low"]
+ACTION_HIGH = INFO["action_high"]
 
 
 def act(observation):
@@ -179,6 +219,24 @@ def act(observation):
         hidden = np.tanh(hidden @ weights + bias)
     weights, bias = _LAYERS[-1]
     return np.clip(hidden @ weights + bias, -1.0, 1.0)
+
+
+def to_env(action):
+    """An action of `act` in the environment's own units: -1 is ACTION_LOW, 1 is ACTION_HIGH, and none is beyond."""
+    if ACTION_LOW is None or ACTION_HIGH is None:
+        raise ValueError("this policy does not say its environment's range of actions: scale them yourself")
+    low, high = np.array(ACTION_LOW, dtype=np.float64), np.array(ACTION_HIGH, dtype=np.float64)
+    part = 0.5 * (np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0) + 1.0)
+    if part.ndim not in (1, 2) or part.shape[-1] != ACTION_SIZE:
+        raise ValueError(f"action: expected shape [{ACTION_SIZE}] or [B, {ACTION_SIZE}], got {list(part.shape)}")
+    scaled = np.clip((1.0 - part) * low + part * high, low, high)
+    exact = np.array_equal(low, np.float32(low)) and np.array_equal(high, np.float32(high))
+    return scaled.astype(np.float32 if exact else np.float64)
+
+
+def control(observation):
+    """The action in the environment's own units: `to_env(act(observation))`."""
+    return to_env(act(observation))
 
 
 def _layers(text):

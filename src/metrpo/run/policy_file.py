@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
@@ -39,6 +39,34 @@ class PolicyInfo:
     """Mean real return of the deterministic policy at that time."""
     activation: str = "tanh"
     """Of the hidden layers; the output layer is linear, clipped to [-1, 1]."""
+    observation: tuple[tuple[int, str], ...] | None = None
+    """The parts of an observation, in order: how many numbers, and what they are; None: unknown."""
+    action_low: tuple[float, ...] | None = None
+    """[A], what the environment takes for an action of -1; None: unknown."""
+    action_high: tuple[float, ...] | None = None
+    """[A], what it takes for an action of 1; None: unknown."""
+
+
+_MOST = 1e300
+"""Beyond it the difference of two bounds may overflow."""
+_SINCE = ("observation", "action_low", "action_high")
+"""Fields that older policies lack."""
+
+
+class Interface(Protocol):
+    """What a task's environment shows and takes (`metrpo.world.interface.Interface`)."""
+
+    @property
+    def observation(self) -> tuple[tuple[int, str], ...]:
+        """The parts of an observation, in order: how many numbers, and what they are."""
+
+    @property
+    def action_low(self) -> tuple[float, ...]:
+        """[A]"""
+
+    @property
+    def action_high(self) -> tuple[float, ...]:
+        """[A]"""
 
 
 class Weights(Protocol):
@@ -79,9 +107,31 @@ class LoadedPolicy:
         weights, bias = self.layers[-1]
         return np.clip(hidden @ weights + bias, -1.0, 1.0)
 
+    def to_env(self, action: Any) -> np.ndarray:
+        """An action in [-1, 1] in the environment's own units, within its bounds: [A] -> [A] or [B, A] -> [B, A].
+
+        float32 where that holds the bounds exactly, else float64. Raises `ValueError` for other shapes, and when the
+        policy does not say the bounds, as older ones do not.
+        """
+        if self.info.action_low is None or self.info.action_high is None:
+            raise ValueError(f"the policy for {brief(self.info.task)} does not say its environment's range of actions")
+        low, high = np.array(self.info.action_low), np.array(self.info.action_high)
+        part = 0.5 * (np.clip(np.asarray(action, np.float64), -1.0, 1.0) + 1.0)
+        if part.ndim not in (1, 2) or part.shape[-1] != len(low):
+            raise ValueError(f"action: expected shape [{len(low)}] or [B, {len(low)}], got {list(part.shape)}")
+        scaled = np.clip((1.0 - part) * low + part * high, low, high)
+        exact = np.array_equal(low, np.float32(low)) and np.array_equal(high, np.float32(high))
+        return scaled.astype(np.float32 if exact else np.float64)
+
 
 def save_policy(
-    directory: Path, policy: Weights, task: str, iteration: int, real_steps: int, return_real: float | None
+    directory: Path,
+    policy: Weights,
+    task: str,
+    iteration: int,
+    real_steps: int,
+    return_real: float | None,
+    interface: Interface | None = None,
 ) -> None:
     """Writes `policy.npz` (weights and info) and `policy.json` (the info for people and other programs).
 
@@ -90,11 +140,18 @@ def save_policy(
     layers = [(np.asarray(w), np.asarray(b)) for w, b in policy.layers]
     hidden = tuple(len(b) for _, b in layers[:-1])
     info = PolicyInfo(task, layers[0][0].shape[0], layers[-1][0].shape[1], hidden, iteration, real_steps, return_real)
+    if interface is not None and _fits(interface, info):  # what does not would not be read again
+        info = replace(info, **{name: getattr(interface, name) for name in _SINCE})
     arrays = {f"{kind}{i}": array for i, layer in enumerate(layers) for kind, array in zip("wb", layer, strict=True)}
     write_arrays(directory / FILE, arrays | {"log_std": np.asarray(policy.log_std)}, {"policy": asdict(info)})
     digest = hashlib.sha256((directory / FILE).read_bytes()).hexdigest()
     beside = {"format": FORMAT, "metrpo": metrpo_version(), **asdict(info), "file": FILE, "sha256": digest}
     atomic_write(directory / "policy.json", json.dumps(beside, indent=2) + "\n")
+
+
+def _fits(interface: Interface, info: PolicyInfo) -> bool:
+    sizes = (sum(size for size, _ in interface.observation), len(interface.action_low), len(interface.action_high))
+    return sizes == (info.observation_size, info.action_size, info.action_size)
 
 
 def load_policy(directory: str | Path) -> LoadedPolicy:
@@ -126,18 +183,21 @@ def _where_else(path: Path) -> str:
 
 def _info(stored: Any, path: Path) -> PolicyInfo:
     names = [f.name for f in fields(PolicyInfo)]
-    missing = [name for name in names if not (isinstance(stored, dict) and name in stored)]
+    missing = [name for name in names if name not in _SINCE and not (isinstance(stored, dict) and name in stored)]
     if missing:
         raise RunDirectoryError(f"{path} is no policy: it lacks {', '.join(missing)}")
     if unknown := [name for name in stored if name not in names]:
         raise RunDirectoryError(f"{path}: expected what this version knows of a policy, got {brief(unknown)}")
-    sizes = stored["hidden"]
+    stored = dict.fromkeys(_SINCE) | stored
+    sizes, parts = stored["hidden"], stored["observation"]
     for name, sound, expected in (
         ("task", isinstance(stored["task"], str), "a name"),
         ("observation_size", _is_size(stored["observation_size"]), "a whole number above 0"),
         ("action_size", _is_size(stored["action_size"]), "a whole number above 0"),
         ("hidden", isinstance(sizes, list) and all(map(_is_size, sizes)), "a list of whole numbers above 0"),
         ("activation", stored["activation"] == "tanh", "'tanh'"),
+        ("observation", _are_parts(parts, stored["observation_size"]), "[numbers, what they are] for all of it"),
+        *((n, _are_bounds(stored[n], stored["action_size"]), "a number for each action") for n in _SINCE[1:]),
         # These say where it comes from and mean nothing to its use.
         *(
             (n, isinstance(stored[n], int | float | str | None), "a number")
@@ -146,7 +206,24 @@ def _info(stored: Any, path: Path) -> PolicyInfo:
     ):
         if not sound:
             raise RunDirectoryError(f"{path}: {name}: expected {expected}, got {brief(stored[name])}")
-    return PolicyInfo(**{**stored, "hidden": tuple(sizes)})
+    tuples = {name: stored[name] and tuple(stored[name]) for name in ("action_low", "action_high")}
+    tuples |= {"hidden": tuple(sizes), "observation": parts and tuple(map(tuple, parts))}
+    return PolicyInfo(**{**stored, **tuples})
+
+
+def _are_parts(parts: Any, size: int) -> bool:
+    if parts is None:
+        return True
+    pairs = isinstance(parts, list) and all(isinstance(part, list) and len(part) == 2 for part in parts)
+    sound = pairs and all(_is_size(number) and isinstance(text, str) for number, text in parts)
+    return sound and sum(number for number, _ in parts) == size
+
+
+def _are_bounds(bounds: Any, size: int) -> bool:
+    if bounds is None:
+        return True
+    numbers = isinstance(bounds, list) and all(type(b) in (int, float) and abs(b) <= _MOST for b in bounds)
+    return numbers and len(bounds) == size
 
 
 def _is_size(value: Any) -> bool:

@@ -38,6 +38,8 @@ class Known:
     """State dimensions on which the dynamics do not depend: global positions."""
     description: str = ""
     """One line."""
+    added: int = 0
+    """Global positions at the head of the observation, which the environment leaves out unless asked for them."""
 
 
 def _squared(x: Array) -> Array:
@@ -213,7 +215,7 @@ def _known(
 ) -> Known:
     """A task of Gymnasium; where global positions are unseen, they are added to the observation."""
     added = {"exclude_current_positions_from_observation": False} if unseen else {}
-    return Known(name, partial(_make, name, **added), reward, terminated, unseen, description)
+    return Known(name, partial(_make, name, **added), reward, terminated, unseen, description, len(unseen))
 
 
 _hopper, _walker = (_forward(0.008, 1e-3, ends) for ends in (_hopper_terminated, _walker_terminated))

@@ -23,6 +23,7 @@ from metrpo.environment_ids import HORIZONS, env_id, register_ids
 from metrpo.errors import TaskError
 from metrpo.gl import INSTALL_GL, gl_library
 from metrpo.types import Array
+from metrpo.world.interface import of_paper_task
 from metrpo.world.registry import get_task, register
 from metrpo.world.task import Task
 
@@ -220,7 +221,8 @@ def _add(
 ) -> None:
     """Makes a task known to metrpo; Gymnasium knows it by `metrpo.environment_ids`, with its time limit."""
     _ROBOTS[name] = robot
-    register(Task(name, env_id(name), *sizes, HORIZONS[name], reward, terminated, unseen, description))
+    shows = of_paper_task(name, sizes[1])
+    register(Task(name, env_id(name), *sizes, HORIZONS[name], reward, terminated, unseen, description, interface=shows))
 
 
 register_ids()

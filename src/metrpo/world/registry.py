@@ -9,6 +9,7 @@ from functools import cache
 import gymnasium
 
 from metrpo.errors import TaskError
+from metrpo.world.interface import with_positions
 from metrpo.world.known import KNOWN
 from metrpo.world.resolve import resolve, task_of
 from metrpo.world.task import Task
@@ -58,7 +59,7 @@ def without_formulas(task: Task) -> Task:
 @cache
 def _with_formulas(name: str) -> Task:
     known = KNOWN[name]
-    return task_of(
+    task = task_of(
         known.make,
         known.reward,
         known.terminated,
@@ -66,3 +67,6 @@ def _with_formulas(name: str) -> Task:
         unseen=known.unseen,
         description=known.description,
     )
+    if not (known.added and task.interface):
+        return task
+    return dataclasses.replace(task, interface=with_positions(task.interface, name, known.added))

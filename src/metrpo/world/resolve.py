@@ -17,7 +17,7 @@ import gymnasium
 
 from metrpo.errors import TaskError
 from metrpo.types import Array
-from metrpo.world import returned
+from metrpo.world import interface, returned
 from metrpo.world.guard import Guarded
 from metrpo.world.limits import require_horizon
 from metrpo.world.task import Task
@@ -55,12 +55,13 @@ def task_of(
         state, _ = with_limit.reset(seed=0)
         with_limit.step(with_limit.action_space.sample())
         actions, limit = with_limit.action_size, with_limit.time_limit
+        shows = interface.of_env(with_limit._env, called)
     if limit is None:
         raise TaskError(
             f"{called}: expected an environment with a time limit, got none: register it with max_episode_steps, wrap "
             "it in gymnasium.wrappers.TimeLimit, or give metrpo.task_of(..., horizon=...)"
         )
-    return Task(called, called, len(state), actions, limit, reward, terminated, unseen, description, make)
+    return Task(called, called, len(state), actions, limit, reward, terminated, unseen, description, make, shows)
 
 
 def _make(env: str | MakeEnv, name: str, horizon: int | None, **kwargs: Any) -> Guarded:

@@ -11,6 +11,7 @@ import gymnasium
 from metrpo.errors import TaskError
 from metrpo.types import Array
 from metrpo.world.guard import refuse_running_statistics
+from metrpo.world.interface import Interface
 from metrpo.world.limits import require_horizon, require_size
 
 
@@ -39,6 +40,8 @@ class Task:
     """One line for `metrpo tasks`."""
     make: Callable[..., gymnasium.Env] | None = None
     """Makes the environment, in place of `gymnasium.make(env_id)`."""
+    interface: Interface | None = None
+    """What the environment shows and takes, as a policy's file says it; None: unknown."""
 
     def __post_init__(self) -> None:
         require_size(self.name, self.state_size)
