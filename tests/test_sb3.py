@@ -16,6 +16,7 @@ import torch
 import probe
 from metrpo import training
 from metrpo.algorithm import evaluate
+from metrpo.baselines import openai_defaults as defaults
 from metrpo.baselines import sb3
 from metrpo.config import Config
 from metrpo.errors import MetrpoError
@@ -166,7 +167,7 @@ def test_the_exported_policy_acts_as_stable_baselines3_predicts(runs, method, tm
 
 def test_the_initial_std_is_the_configs(runs):
     np.testing.assert_allclose(np.exp(runs["ppo"][0][0].policy.log_std), TINY.policy.initial_std, rtol=1e-6)
-    np.testing.assert_allclose(np.exp(runs["ddpg"][0][0].policy.log_std), sb3.DDPG_NOISE, rtol=1e-6)
+    np.testing.assert_allclose(np.exp(runs["ddpg"][0][0].policy.log_std), defaults.DDPG_NOISE, rtol=1e-6)
 
 
 # ---------------------------------------------------------------- real steps and episodes
@@ -206,7 +207,7 @@ class Counted:
 def test_real_steps_are_counted_one_by_one(monkeypatch, method, steps, taken):
     """Whole updates: PPO's of whole minibatches of 64 and up to PPO_STEPS, DDPG's of up to 100 steps."""
     counted = Counted(monkeypatch)
-    monkeypatch.setattr(sb3, "PPO_STEPS", 256)
+    monkeypatch.setattr(defaults, "PPO_STEPS", 256)
     config = override(TINY, {"method": method, "collect.steps": steps})
     state, row = sb3.step(config, sb3.init(config))
     evaluated = config.evaluation_episodes * probe.HORIZON
@@ -225,39 +226,140 @@ def test_every_iteration_starts_with_a_fresh_episode():
     assert np.abs(replay["observations"][firsts]).max() <= probe.START
 
 
-def test_the_end_of_the_clock_is_no_end_and_the_tasks_is(runs):
-    assert not runs["ddpg"][0][3].replay["dones"].any()
+def test_the_end_of_the_clock_is_an_end_as_the_tasks_is(runs):
+    """As in OpenAI baselines: undiscounted, nobody can say what would follow."""
+    ends = np.flatnonzero(runs["ddpg"][0][3].replay["dones"])
+    # Iterations of 200 steps, episodes of 20.
+    np.testing.assert_array_equal(ends, np.arange(19, 600, 20))
     states, _ = run(override(TINY, {"method": "ddpg", "task": "EndingProbe"}), 2)
     replay = states[2].replay
-    np.testing.assert_array_equal(replay["dones"], probe.beyond(replay["next_observations"]))
-    assert 0 < replay["dones"].sum() < 400
+    early = probe.beyond(replay["next_observations"])
+    assert replay["dones"][early].all()
+    assert 0 < early.sum() < replay["dones"].sum() < 400
 
 
-def test_ppo_values_what_follows_the_end_of_the_clock(monkeypatch):
-    """With gae_lambda 0 every advantage is r + gamma V(s') - V(s), also where the clock ended the episode."""
-    monkeypatch.setitem(sb3.PPO_SETTINGS, "gae_lambda", 0.0)
+@pytest.mark.parametrize("discount", [1.0, 0.9])
+def test_ppo_values_nothing_after_the_end_of_the_clock(monkeypatch, discount):
+    monkeypatch.setitem(defaults.PPO_SETTINGS, "gae_lambda", 0.0)
     seen = {}
 
     def train(model):
         buffer = model.rollout_buffer
         seen.update(first=buffer.episode_starts[:, 0], rewards=buffer.rewards[:, 0], states=buffer.observations[:, 0])
-        seen.update(actions=buffer.actions[:, 0], values=model.policy.predict_values)
+        seen.update(actions=buffer.actions[:, 0], values=buffer.values[:, 0], advantages=buffer.advantages[:, 0])
 
-    monkeypatch.setattr(sb3.PPO, "train", train)
-    config = override(TINY, {"method": "ppo"})
+    monkeypatch.setattr(defaults.PPO, "train", train)
+    config = override(TINY, {"method": "ppo", "advantage.discount": discount})
     sb3.step(config, sb3.init(config))
     (last, *_) = np.flatnonzero(seen["first"][1:])
     action = np.clip(seen["actions"][last], -1, 1).astype(float)
-    following = probe.A @ seen["states"][last] + probe.B @ action
-    value = seen["values"](torch.from_numpy(following[None].astype(np.float32))).item()
-    expected = probe.reward(None, action, following) + 0.99 * value
+    reward = probe.reward(None, action, probe.A @ seen["states"][last] + probe.B @ action)
     assert last == probe.HORIZON - 1
-    assert abs(value) > 1e-3
-    assert seen["rewards"][last] == pytest.approx(expected, abs=1e-5)
+    assert seen["advantages"][last] == pytest.approx(reward - seen["values"][last], abs=1e-5)
+    following = seen["rewards"][3] + discount * seen["values"][4] - seen["values"][3]
+    assert seen["advantages"][3] == pytest.approx(following, abs=1e-5)
+
+
+# ---------------------------------------------------------------- as in OpenAI baselines
+
+
+@METHODS
+def test_observations_learned_from_are_counted_once(runs, method):
+    states, _ = runs[method]
+    assert states[0].statistics["count"] == pytest.approx(0.01)
+    for state in states[1:]:
+        assert state.statistics["count"] == pytest.approx(state.real_steps + 0.01)
+        assert {x.dtype for x in state.statistics.values()} == {np.dtype(np.float64)}
+    if method == "ddpg":
+        observations = states[3].replay["observations"].astype(float)
+        np.testing.assert_allclose(states[3].statistics["sum"], observations.sum(0), atol=1e-4)
+        np.testing.assert_allclose(states[3].statistics["squares"], (observations**2).sum(0) + 0.01, rtol=1e-6)
+
+
+def test_statistics_are_running_ones_and_fold_into_a_layer():
+    rng = np.random.default_rng(0)
+    x = (rng.standard_normal((500, 3)) * [5, 0.3, 0.001] + [100, 0, 2]).astype(np.float32)
+    s = defaults.Statistics(3)
+    np.testing.assert_array_equal([s.mean, s.std], [[0] * 3, [1] * 3])
+    for part in np.split(x, 10):
+        s.update(part)
+    np.testing.assert_allclose(s.mean, x.mean(0), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(s.std[:2], x.std(0)[:2], rtol=0.02)
+    assert s.std[2] == pytest.approx(0.1), "what hardly moves is not blown up"
+    weights, biases = rng.standard_normal((3, 4)), rng.standard_normal(4)
+    folded, shifted = s.folded(weights, biases)
+    np.testing.assert_allclose(x @ folded + shifted, (x - s.mean) / s.std @ weights + biases, atol=1e-4)
+
+
+@METHODS
+def test_networks_see_observations_by_their_statistics(runs, method):
+    """Another unit and another zero of the observations, taken in by the statistics, change nothing."""
+    config, state = override(TINY, {"method": method}), runs[method][0][3]
+    env, scale, shift = sb3._environment(config), np.array([50.0, 4.0]), np.array([300.0, -20.0])
+    n = state.statistics["count"]
+    moved = state._replace(
+        statistics={
+            "sum": state.statistics["sum"] * scale + n * shift,
+            "squares": state.statistics["squares"] * scale**2
+            + 2 * shift * scale * state.statistics["sum"]
+            + n * shift**2,
+            "count": n,
+        }
+    )
+    states = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
+    expected, _ = sb3._model(config, env, 0, state).predict(states, deterministic=True)
+    got, _ = sb3._model(config, env, 0, moved).predict((states * scale + shift).astype(np.float32), deterministic=True)
+    env.close()
+    np.testing.assert_allclose(got, expected, atol=2e-3)
+    assert np.ptp(expected) > 0.02
+
+
+def test_the_critic_normalises_its_layers_and_takes_the_action_in_its_second():
+    torch.manual_seed(0)
+    critic = defaults._Value(3, 2, (5, 4))
+    for norm in critic.norms:
+        torch.nn.init.normal_(norm.weight)
+        torch.nn.init.normal_(norm.bias)
+    x = np.random.default_rng(0).normal(size=(6, 5)).astype(np.float32)
+    p = {name: value.detach().numpy() for name, value in critic.named_parameters()}
+
+    def layer(inputs, name, norm):
+        out = inputs @ p[f"{name}.weight"].T + p[f"{name}.bias"]
+        out = (out - out.mean(-1, keepdims=True)) / np.sqrt(out.var(-1, keepdims=True) + 1e-5)
+        return np.maximum(out * p[f"norms.{norm}.weight"] + p[f"norms.{norm}.bias"], 0)
+
+    hidden = layer(np.concatenate([layer(x[:, :3], "first", 0), x[:, 3:]], axis=1), "second", 1)
+    expected = hidden @ p["last.weight"].T + p["last.bias"]
+    np.testing.assert_allclose(critic(torch.from_numpy(x)).detach().numpy(), expected, atol=1e-5)
+
+
+def test_l2_pulls_on_the_critics_hidden_weights_alone(runs):
+    config, state = override(TINY, {"method": "ddpg"}), runs["ddpg"][0][3]
+    env = sb3._environment(config)
+    model = sb3._model(config, env, 0, state)
+    env.close()
+    critic = model.critic
+    for memory in critic.optimizer.state.values():
+        memory["exp_avg"].zero_()
+    before = {name: value.detach().clone() for name, value in critic.named_parameters()}
+    for value in critic.parameters():
+        value.grad = torch.zeros_like(value)
+    critic.optimizer.step()
+    pulled = {name for name, value in critic.named_parameters() if not torch.equal(value, before[name])}
+    assert pulled == {"qf0.first.weight", "qf0.second.weight"}
+    assert all(value.norm() < before[name].norm() for name, value in critic.named_parameters() if name in pulled)
+    # Adam's memory after one step: 0.1 of the gradient, which is DDPG_DECAY times the weight.
+    memory = critic.optimizer.state[critic.qf0.first.weight]["exp_avg"]
+    np.testing.assert_allclose(memory.numpy(), 0.1 * 0.01 * before["qf0.first.weight"].numpy(), rtol=1e-4)
+
+
+def test_an_untrained_actor_hardly_acts(runs):
+    policy = runs["ddpg"][0][0].policy
+    assert np.abs(gaussian.mean(policy, np.random.default_rng(0).normal(size=(100, 2)))).max() < 0.03
 
 
 def test_the_replay_buffer_forgets_the_oldest_first(monkeypatch):
-    monkeypatch.setattr(sb3, "DDPG_BUFFER", 250)
+    monkeypatch.setattr(defaults, "DDPG_BUFFER", 250)
     config = override(TINY, {"method": "ddpg", "collect.steps": 100})
     states, _ = run(config, 4)
     assert [len(s.replay["rewards"]) for s in states] == [0, 100, 200, 250, 250]
@@ -307,21 +409,24 @@ def test_the_algorithm_has_the_settings_named(method):
     sizes = {name: tuple(x.shape) for name, x in model.policy.named_parameters() if name.endswith("weight")}
     if method == "ppo":
         assert (model.n_steps, model.batch_size, model.n_epochs, model.gae_lambda) == (128, 64, 10, 0.95)
-        assert (model.gamma, model.clip_range(1.0), model.learning_rate) == (0.99, 0.2, 3e-4)
+        assert (model.gamma, model.clip_range(1.0), model.learning_rate) == (1.0, 0.2, 3e-4)
+        assert model.max_grad_norm == np.inf
         assert sizes["mlp_extractor.value_net.2.weight"] == (6, 8)
     else:
-        assert (model.gamma, model.tau, model.batch_size, model.learning_starts) == (0.99, 0.01, 64, 64)
+        assert (model.gamma, model.tau, model.batch_size, model.learning_starts) == (1.0, 0.01, 64, 64)
         assert (model.train_freq.frequency, model.gradient_steps, model.policy_delay) == (100, 50, 1)
         model._update_learning_rate([model.actor.optimizer, model.critic.optimizer])
-        assert [o.param_groups[0]["lr"] for o in sb3._optimisers(model)] == [1e-4, 1e-3]
-        assert sizes["critic.qf0.2.weight"] == (64, 64)
+        assert [{g["lr"] for g in o.param_groups} for o in sb3._optimisers(model)] == [{1e-4}, {1e-3}]
+        assert sizes["critic.qf0.second.weight"] == (64, 64 + 2)
     assert torch.get_num_threads() == 1
 
 
 @pytest.mark.parametrize("library", ["torch", "stable_baselines3"])
 def test_without_its_libraries_the_error_says_what_to_install(monkeypatch, library):
     monkeypatch.setitem(sys.modules, library, None)
-    monkeypatch.delitem(sys.modules, "metrpo.baselines.sb3")
+    for module in ("sb3", "openai_defaults"):
+        monkeypatch.delitem(sys.modules, f"metrpo.baselines.{module}")
+    monkeypatch.delattr("metrpo.baselines.openai_defaults")
     with pytest.raises(MetrpoError, match=r"make baselines.*torch==2\.13\.0.*metrpo\[baselines\]"):
         training.init(override(TINY, {"method": "ppo"}))
 

@@ -1,8 +1,9 @@
 """PPO (Schulman et al. 2017) and DDPG (Lillicrap et al. 2016) of Stable-Baselines3 in the real environment.
 
 Every iteration builds Stable-Baselines3's objects anew from the state and the iteration's seed and starts with a fresh
-episode, so that a resumed run is the same run. Observations are not normalised: the exported policy takes raw states.
-Needs the extra `baselines`; importing this without it raises `MetrpoError`.
+episode, so that a resumed run is the same run. They are made what OpenAI baselines' are
+(`metrpo.baselines.openai_defaults`). The exported policy takes raw states: the statistics by which observations are
+standardised go into its first layer. Needs the extra `baselines`; importing this without it raises `MetrpoError`.
 """
 
 from __future__ import annotations
@@ -28,35 +29,25 @@ from metrpo.world.returned import closing
 
 try:
     import torch
-    from stable_baselines3 import DDPG, PPO
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.logger import Logger
     from stable_baselines3.common.monitor import Monitor
     from stable_baselines3.common.noise import NormalActionNoise
-    from stable_baselines3.common.utils import update_learning_rate
+
+    from metrpo.baselines import openai_defaults as defaults
+    from metrpo.baselines.openai_defaults import (
+        ClockEnds,
+        NormedDDPG,
+        NormedPPO,
+        NormedTD3Policy,
+        Standardised,
+        Statistics,
+    )
 except ImportError as error:
     raise MetrpoError(
         f"the systems ppo and ddpg need PyTorch and Stable-Baselines3 ({error}): run `make baselines`, or "
         "`pip install torch==2.13.0` and then `pip install 'metrpo[baselines]'`"
     ) from error
-
-PPO_STEPS = 2048
-"""Real steps per update; this and `PPO_SETTINGS`: OpenAI baselines, ppo2's defaults for MuJoCo (but for the decay of
-the learning rate and the clipping of values), which are Stable-Baselines3's defaults."""
-PPO_SETTINGS: dict[str, Any] = {
-    **{"learning_rate": 3e-4, "batch_size": 64, "n_epochs": 10, "clip_range": 0.2, "max_grad_norm": 0.5},
-    **{"gamma": 0.99, "gae_lambda": 0.95, "vf_coef": 0.5, "ent_coef": 0.0},
-}
-DDPG_SETTINGS: dict[str, Any] = {"gamma": 0.99, "tau": 0.01, "batch_size": 64, "gradient_steps": 50}
-"""This and all below but `DDPG_WARM_UP`: OpenAI baselines, ddpg's defaults where Stable-Baselines3 has the setting."""
-DDPG_BUFFER, DDPG_STEPS = 1_000_000, 100
-"""Most transitions kept (the oldest go first), and real steps between two rounds of `gradient_steps`."""
-DDPG_CRITIC, DDPG_RATES = (64, 64), (1e-4, 1e-3)
-"""Sizes of the critic's hidden layers, and Adam's step sizes for the actor and the critic."""
-DDPG_NOISE = 0.2
-"""Standard deviation of the actions' Gaussian noise (there, of parameter noise adapted to have that effect)."""
-DDPG_WARM_UP = 1000
-"""Uniform actions before the first update (TD3's, Fujimoto et al. 2018); half an iteration at most."""
 
 
 class State(NamedTuple):
@@ -72,6 +63,8 @@ class State(NamedTuple):
     """Of all networks, by PyTorch's names."""
     adam: tuple[tuple[tuple[np.ndarray, ...], ...], ...]
     """Of every optimiser, of every parameter: the entries `_ADAM` of its memory."""
+    statistics: dict[str, np.ndarray]
+    """Sums over the observations learned from, float64."""
     replay: dict[str, np.ndarray]
     """DDPG's n transitions, the oldest first: `_REPLAY`, float32, [n, S] twice, [n, A], [n] twice. Empty for PPO."""
 
@@ -121,6 +114,8 @@ class _Watch(BaseCallback):
         self._collecting.enter_context(self._clock("collect"))
 
     def _on_step(self) -> bool:
+        if isinstance(self.model, NormedDDPG):  # PPO's batch may not change while it is drawn
+            self.model.actor.features_extractor._statistics.update(self.model._last_obs)
         return True
 
     def _on_rollout_end(self) -> None:
@@ -132,7 +127,7 @@ def _environment(config: Config) -> Monitor:
     # float32 halves the replay buffer, and is what the networks compute in.
     task = get_task(config.task)
     space = Box(-np.inf, np.inf, (task.state_size,), np.float32)
-    return Monitor(TransformObservation(task.make_env(), lambda state: state.astype(np.float32), space))
+    return Monitor(ClockEnds(TransformObservation(task.make_env(), lambda state: state.astype(np.float32), space)))
 
 
 def _seed(config: Config, iteration: int, stage: Stage) -> int:
@@ -142,50 +137,62 @@ def _seed(config: Config, iteration: int, stage: Stage) -> int:
 # ---------------------------------------------------------------- the two algorithms
 
 
-def _ppo(config: Config, env: Monitor, seed: int, _: State | None) -> PPO:
-    hidden, batch = list(config.policy.hidden), PPO_SETTINGS["batch_size"]
+def _ppo(config: Config, env: Monitor, seed: int, _: State | None) -> NormedPPO:
+    hidden, settings = list(config.policy.hidden), defaults.PPO_SETTINGS | {"gamma": config.advantage.discount}
     networks: dict[str, Any] = {"net_arch": {"pi": hidden, "vf": hidden}, "activation_fn": torch.nn.Tanh}
-    networks["log_std_init"] = math.log(config.policy.initial_std)
-    steps = min(PPO_STEPS, batch * math.ceil(config.collect.steps / batch))
-    return PPO("MlpPolicy", env, n_steps=steps, policy_kwargs=networks, seed=seed, device="cpu", **PPO_SETTINGS)
+    networks |= {"log_std_init": math.log(config.policy.initial_std), **_standardised(env)}
+    batch = settings["batch_size"]
+    steps = min(defaults.PPO_STEPS, batch * math.ceil(config.collect.steps / batch))
+    return NormedPPO("MlpPolicy", env, n_steps=steps, policy_kwargs=networks, seed=seed, device="cpu", **settings)
 
 
 def _ppo_policy(model: Any) -> Policy:
     mean = [*model.policy.mlp_extractor.policy_net, model.policy.action_net]
-    return Policy(_layers(mean), _numpy(model.policy.log_std))
+    return Policy(_raw(model, _layers(mean)), _numpy(model.policy.log_std))
 
 
-class _DDPG(DDPG):
-    def _update_learning_rate(self, optimizers: Any) -> None:
-        # Called before every round of updates; Stable-Baselines3 would give both networks one rate.
-        for optimizer, rate in zip(optimizers, DDPG_RATES, strict=True):
-            update_learning_rate(optimizer, rate)
-
-
-def _ddpg(config: Config, env: Monitor, seed: int, state: State | None) -> _DDPG:
+def _ddpg(config: Config, env: Monitor, seed: int, state: State | None) -> NormedDDPG:
     steps, kept = config.collect.steps, len(state.replay["rewards"]) if state else 0
     action = np.zeros(get_task(config.task).action_size)
-    nets = {"net_arch": {"pi": list(config.policy.hidden), "qf": list(DDPG_CRITIC)}, "activation_fn": torch.nn.Tanh}
-    return _DDPG(
-        "MlpPolicy",
+    sizes = {"pi": list(config.policy.hidden), "qf": list(defaults.DDPG_CRITIC)}
+    return NormedDDPG(
+        NormedTD3Policy,
         env,
+        gamma=config.advantage.discount,
         # Room for this iteration, rounded up: the next one has a buffer of its own.
-        buffer_size=min(DDPG_BUFFER, kept + steps + DDPG_STEPS),
-        learning_starts=min(DDPG_WARM_UP, steps // 2),
-        train_freq=min(DDPG_STEPS, steps),
-        action_noise=NormalActionNoise(action, action + DDPG_NOISE),
-        policy_kwargs=nets,
+        buffer_size=min(defaults.DDPG_BUFFER, kept + steps + defaults.DDPG_STEPS),
+        learning_starts=min(defaults.DDPG_WARM_UP, steps // 2),
+        train_freq=min(defaults.DDPG_STEPS, steps),
+        action_noise=NormalActionNoise(action, action + defaults.DDPG_NOISE),
+        policy_kwargs={"net_arch": sizes, "activation_fn": torch.nn.Tanh, **_standardised(env)},
         seed=seed,
         device="cpu",
-        **DDPG_SETTINGS,
+        **defaults.DDPG_SETTINGS,
     )
 
 
 def _ddpg_policy(model: Any) -> Policy:
     # The actor's output goes through tanh, as only hidden layers do in a policy: an identity after it makes it one.
-    layers = _layers(model.actor.mu)
+    layers = _raw(model, _layers(model.actor.mu))
     identity = np.eye(len(layers[-1][1]), dtype=np.float32)
-    return Policy((*layers, (identity, 0 * identity[0])), np.full(len(identity), math.log(DDPG_NOISE), np.float32))
+    log_std = np.full(len(identity), math.log(defaults.DDPG_NOISE), np.float32)
+    return Policy((*layers, (identity, 0 * identity[0])), log_std)
+
+
+def _standardised(env: Monitor) -> dict[str, Any]:
+    """What makes all networks of an algorithm see observations by the same statistics."""
+    statistics = Statistics(env.observation_space.shape[0])
+    return {"features_extractor_class": Standardised, "features_extractor_kwargs": {"statistics": statistics}}
+
+
+def _statistics(model: Any) -> Statistics:
+    statistics: Statistics = model.policy_kwargs["features_extractor_kwargs"]["statistics"]
+    return statistics
+
+
+def _raw(model: Any, layers: tuple[tuple[np.ndarray, np.ndarray], ...]) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """The layers of a network for raw observations."""
+    return (_statistics(model).folded(*layers[0]), *layers[1:])
 
 
 def _layers(modules: Iterable[Any]) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
@@ -202,7 +209,7 @@ _METHODS: _Table = {"ppo": (_ppo, _ppo_policy), "ddpg": (_ddpg, _ddpg_policy)}
 _ADAM = ("step", "exp_avg", "exp_avg_sq")
 """What PyTorch's Adam keeps of a parameter."""
 _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones")
-"""The arrays of the replay buffer; the last is 1 where the task, not the clock, ended the episode."""
+"""The arrays of the replay buffer; the last is 1 where the episode ended."""
 
 
 def _model(config: Config, env: Monitor, seed: int, state: State | None) -> Any:
@@ -214,8 +221,9 @@ def _model(config: Config, env: Monitor, seed: int, state: State | None) -> Any:
         return model
     model.num_timesteps = state.real_steps
     model.policy.load_state_dict({name: torch.from_numpy(value) for name, value in state.parameters.items()})
+    _statistics(model).put(state.statistics)
     for optimiser, memories in zip(_optimisers(model), state.adam, strict=True):
-        for parameter, memory in zip(optimiser.param_groups[0]["params"], memories, strict=True):
+        for parameter, memory in zip(_parameters(optimiser), memories, strict=True):
             optimiser.state[parameter] = dict(zip(_ADAM, map(torch.tensor, memory), strict=True))
     if state.replay:
         _put_replay(model.replay_buffer, state.replay)
@@ -229,6 +237,7 @@ def _state(config: Config, model: Any, iteration: int) -> State:
         policy=_METHODS[config.method][1](model),
         parameters={name: _numpy(value) for name, value in model.policy.state_dict().items()},
         adam=tuple(_memories(optimiser) for optimiser in _optimisers(model)),
+        statistics=_statistics(model).sums,
         replay=_get_replay(model.replay_buffer) if config.method == "ddpg" else {},
     )
 
@@ -243,7 +252,11 @@ def _memories(optimiser: Any) -> tuple[tuple[np.ndarray, ...], ...]:
         fresh = {name: torch.zeros(() if name == "step" else parameter.shape) for name in _ADAM}
         return tuple(_numpy(optimiser.state.get(parameter, fresh)[name]) for name in _ADAM)
 
-    return tuple(memory(parameter) for parameter in optimiser.param_groups[0]["params"])
+    return tuple(memory(parameter) for parameter in _parameters(optimiser))
+
+
+def _parameters(optimiser: Any) -> list[Any]:
+    return [parameter for group in optimiser.param_groups for parameter in group["params"]]
 
 
 def _put_replay(buffer: Any, replay: dict[str, np.ndarray]) -> None:
@@ -254,8 +267,6 @@ def _put_replay(buffer: Any, replay: dict[str, np.ndarray]) -> None:
 
 
 def _get_replay(buffer: Any) -> dict[str, np.ndarray]:
-    # As Stable-Baselines3 does when it samples: an end by the clock is no end.
-    buffer.dones *= 1 - buffer.timeouts
     oldest = buffer.pos if buffer.full else 0
     return {name: np.roll(getattr(buffer, name)[: buffer.size(), 0], -oldest, axis=0) for name in _REPLAY}
 
