@@ -176,6 +176,14 @@ def test_a_policy_of_old_acts_and_says_that_it_knows_no_range(ending, ordinary, 
         assert "not known: scale the actions yourself" in python(path).__doc__
 
 
+def test_a_policy_of_old_for_a_known_task_is_exported_with_its_range(tmp_path):
+    save_policy(tmp_path, random_policy(0, 3, 1), "Pendulum-v1", 1, 1000, 1.0)  # without its interface, as before
+    assert python(export(tmp_path)).control(np.zeros(3)).shape == (1,)
+    save_policy(tmp_path, random_policy(0, 3, 1), f"{tmp_path}/evil.py:make", 1, 1000, 1.0)
+    (tmp_path / "evil.py").write_text("raise SystemExit(9)")
+    assert python(export(tmp_path)).ACTION_LOW is None
+
+
 def test_an_exported_policy_of_a_walker_plays_the_plain_environment(tmp_path):
     """From what its file says alone: which number to put in front, and in which units to act."""
     task = get_task("HalfCheetah-v5")

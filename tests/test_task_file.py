@@ -13,10 +13,10 @@ import pytest
 from helpers import random_policy
 from metrpo import cli
 from metrpo.config import to_json
-from metrpo.errors import TaskError
+from metrpo.errors import ConfigError, TaskError
 from metrpo.presets import override, preset
 from metrpo.run.policy_file import save_policy
-from metrpo.run.task_file import remember, task_of_run
+from metrpo.run.task_file import moved, remember, task_of_run
 from metrpo.stepwise import begin
 from metrpo.training import train
 from metrpo.world import resolve
@@ -136,7 +136,12 @@ def test_a_run_is_evaluated_from_another_folder_and_after_its_file_moved(tmp_pat
     assert code == 2
     assert "expected a Python file at " in said
     assert "found none; if it has moved, say where: --task path/to/file.py:name" in said
-    assert evaluated(capsys, "run", "--task", "moved/mine.py:make") == (0, "mine.py:make")
+    assert evaluated(capsys, "run", "--task", "moved/mine.py:make") == (0, "moved/mine.py:make")
+
+
+def test_a_policy_may_be_evaluated_on_another_task_of_its_sizes(tmp_path, capsys):
+    save_policy(tmp_path / "run", random_policy(0, 11, 3), "Hopper", 1, 200, 1.5)
+    assert evaluated(capsys, "run", "--task", "HopperUpright") == (0, "HopperUpright")
 
 
 class State(NamedTuple):
@@ -159,20 +164,30 @@ def test_a_run_remembers_where_its_file_lay(command, tmp_path, monkeypatch):
     assert about["metrpo"], "what was there stays"
 
 
-def test_every_command_that_plays_or_learns_takes_the_place_anew(monkeypatch, capsys):
+@pytest.mark.parametrize("command", ["collect", "improve", "evaluate", "render"])
+def test_every_command_that_plays_or_learns_takes_the_place_anew(command, monkeypatch, capsys):
     write("mine.py", MAKE, horizon=5)
     a_run(Path("run"), "mine.py:make")
     Path("run/config.json").write_text(to_json(preset("mine.py:make")))
     Path("mine.py").rename("there/moved.py")
     resolve._resolve.cache_clear()
-    places = []
-    monkeypatch.setattr(resolve, "place", lambda name, where: places.append((name, where)))
     monkeypatch.setattr("metrpo.run.machine.prepare", lambda *_, **__: None)
-    for command in ("collect", "improve", "evaluate", "render"):
-        # For `place` is a stub, the file is not found.
-        assert cli.main([command, "run", "--task", "there/moved.py:make"]) == 2
-        assert "mine.py:make: expected a Python file at" in capsys.readouterr().err
-    assert places == [("mine.py:make", "there/moved.py:make")] * 4
+    made = []
+    monkeypatch.setattr(resolve, "task_of", lambda make, *_, **__: made.append(make.__module__) or raising())
+    assert cli.main([command, "run"]) == 2
+    assert "mine.py:make: expected a Python file at" in capsys.readouterr().err
+    assert cli.main([command, "run", "--task", "there/moved.py:make"]) == 2
+    assert "far enough" in capsys.readouterr().err
+    assert [name.startswith("metrpo_task_moved") for name in made] == [True]
+
+
+def raising():
+    raise TaskError("far enough")
+
+
+def test_only_what_lies_in_a_file_or_module_can_have_moved():
+    with pytest.raises(ConfigError, match="task: expected it for a run whose task lies in a file or module, got"):
+        moved("Swimmer", "there/mine.py:make")
 
 
 def test_run_json_of_other_tasks_says_no_file(tmp_path):

@@ -60,8 +60,8 @@ def evaluate(
 ) -> EvaluationResult:
     """Plays whole real episodes with a policy: a run directory, what `load_policy` gives, or any function [S] -> [A].
 
-    `task` is needed for a plain function, and where the file of a run's task has moved. The same seed gives the same
-    start states.
+    `task` is needed for a plain function, and where the file of a run's task has moved; another task of the same sizes
+    may be named too. The same seed gives the same start states.
 
     Raises `RunDirectoryError` when the directory holds no sound policy, `TaskError` for an unknown task, `ConfigError`
     for fewer than one episode or a function without a task; `TaskError` also for a policy of another task's sizes.
@@ -70,12 +70,12 @@ def evaluate(
         raise ConfigError(f"episodes: expected at least 1, got {episodes}")
     _require_seed(seed)
     act = load_policy(policy) if isinstance(policy, str | Path) else policy
-    if isinstance(policy, str | Path) and isinstance(act, LoadedPolicy):
-        known = task_of_run(policy, act.info.task, task)
-    elif name := task or (act.info.task if isinstance(act, LoadedPolicy) else None):
-        known = get_task(name)
+    if task is not None or not isinstance(act, LoadedPolicy):
+        if task is None:
+            raise ConfigError("task: expected the task that this function is to be evaluated on, got none")
+        known = get_task(task)
     else:
-        raise ConfigError("task: expected the task that this function is to be evaluated on, got none")
+        known = task_of_run(policy, act.info.task) if isinstance(policy, str | Path) else get_task(act.info.task)
     if isinstance(act, LoadedPolicy):
         _require_fit(act, known)
     return EvaluationResult(known.name, seed, collect.evaluate(known, act, episodes, seed))
@@ -91,7 +91,7 @@ def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0, ta
     """
     _require_seed(seed)
     policy = load_policy(run_dir)
-    known = task_of_run(run_dir, policy.info.task, task)
+    known = task_of_run(run_dir, policy.info.task) if task is None else get_task(task)
     _require_fit(policy, known)
     return record(known.make_env, policy, Path(out or Path(run_dir) / "video.mp4"), seed)
 

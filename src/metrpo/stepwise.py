@@ -58,7 +58,7 @@ def collect(
     Raises `RunDirectoryError` when `run_dir` holds no run, `TaskError` when the task has no environment to play.
     """
     config = stored_config(run_dir)
-    task_file.task_of_run(run_dir, config.task, task)
+    _settle(run_dir, config.task, task)
     with RunDirectory(run_dir, config) as run:
         state = _state(run, config)
         if data is not None:
@@ -85,7 +85,7 @@ def improve(run_dir: str | Path, progress: Progress = SILENT, task: str | None =
     or no episodes wait.
     """
     config = stored_config(run_dir)
-    task_file.task_of_run(run_dir, config.task, task)
+    _settle(run_dir, config.task, task)
     with RunDirectory(run_dir, config) as run:
         state = _state(run, config)
         episodes = run.episodes.pending()
@@ -102,6 +102,14 @@ def improve(run_dir: str | Path, progress: Progress = SILENT, task: str | None =
         finally:
             progress.close()
     return written
+
+
+def _settle(run_dir: str | Path, name: str, where: str | None) -> None:
+    """Makes the run's task known under its name, from its file's old place or the new one."""
+    if where is None:
+        task_file.task_of_run(run_dir, name)
+    else:
+        task_file.moved(name, where)
 
 
 def _content(episode: Episode) -> tuple[bytes | bool, ...]:

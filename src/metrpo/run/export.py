@@ -11,7 +11,7 @@ import json
 import re
 import textwrap
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from keyword import iskeyword
 from pathlib import Path
 from string import Template
@@ -21,7 +21,7 @@ import numpy as np
 
 from metrpo.errors import MetrpoError, RunDirectoryError
 from metrpo.run.files import atomic_write, metrpo_version
-from metrpo.run.policy_file import FILE, LoadedPolicy, load_policy
+from metrpo.run.policy_file import FILE, LoadedPolicy, load_policy, with_interface
 from metrpo.untrusted import opened
 
 _Writer = Callable[[LoadedPolicy, Path], bytes | str]
@@ -47,7 +47,7 @@ def export(run_dir: Path, out: Path | None = None) -> Path:
         raise MetrpoError(f"{out}: expected a name that ends in {', '.join(_WRITERS)}; got {out.suffix or 'no ending'}")
     if out.suffix == ".py":
         _require_importable(out)
-    policy = load_policy(run_dir)
+    policy = _completed(load_policy(run_dir))
     if out.suffix == ".py" and out.is_file() and not _is_ours(out):
         raise MetrpoError(f"{out} exists and is no exported policy: choose another name, or remove it first")
     atomic_write(out, _WRITERS[out.suffix](policy, source))
@@ -62,6 +62,19 @@ def _require_importable(out: Path) -> None:
     better = re.sub(r"\W+", "_", name).strip("_").lstrip("0123456789_")
     better = better if better.isidentifier() and better != name else f"{better or 'my'}_policy"
     raise MetrpoError(f"{out}: expected a name that Python can import, such as {better}.py, got {out.name}")
+
+
+def _completed(policy: LoadedPolicy) -> LoadedPolicy:
+    """A policy from before its file said what its environment shows and takes, with that of a task of ours."""
+    if policy.info.observation is not None:
+        return policy
+    from metrpo.world.known import KNOWN
+    from metrpo.world.registry import get_task, tasks
+
+    name = policy.info.task
+    if name not in KNOWN and name not in tasks():  # to ask a file of somebody's would run it
+        return policy
+    return replace(policy, info=with_interface(policy.info, get_task(name).interface))
 
 
 def _is_ours(path: Path) -> bool:

@@ -140,8 +140,7 @@ def save_policy(
     layers = [(np.asarray(w), np.asarray(b)) for w, b in policy.layers]
     hidden = tuple(len(b) for _, b in layers[:-1])
     info = PolicyInfo(task, layers[0][0].shape[0], layers[-1][0].shape[1], hidden, iteration, real_steps, return_real)
-    if interface is not None and _fits(interface, info):  # what does not would not be read again
-        info = replace(info, **{name: getattr(interface, name) for name in _SINCE})
+    info = with_interface(info, interface)
     arrays = {f"{kind}{i}": array for i, layer in enumerate(layers) for kind, array in zip("wb", layer, strict=True)}
     write_arrays(directory / FILE, arrays | {"log_std": np.asarray(policy.log_std)}, {"policy": asdict(info)})
     digest = hashlib.sha256((directory / FILE).read_bytes()).hexdigest()
@@ -149,9 +148,14 @@ def save_policy(
     atomic_write(directory / "policy.json", json.dumps(beside, indent=2) + "\n")
 
 
-def _fits(interface: Interface, info: PolicyInfo) -> bool:
+def with_interface(info: PolicyInfo, interface: Interface | None) -> PolicyInfo:
+    """The info with what the environment shows and takes; as it is where that is unknown or of other sizes."""
+    if interface is None:
+        return info
     sizes = (sum(size for size, _ in interface.observation), len(interface.action_low), len(interface.action_high))
-    return sizes == (info.observation_size, info.action_size, info.action_size)
+    if sizes != (info.observation_size, info.action_size, info.action_size):  # it would not be read again
+        return info
+    return replace(info, **{name: getattr(interface, name) for name in _SINCE})
 
 
 def load_policy(directory: str | Path) -> LoadedPolicy:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from metrpo.errors import RunDirectoryError
+from metrpo.errors import ConfigError, RunDirectoryError
 from metrpo.run.files import atomic_write
 from metrpo.untrusted import json_of, text_of
 from metrpo.world import resolve
@@ -23,16 +23,25 @@ def remember(run_dir: str | Path, task: str) -> None:
         atomic_write(Path(run_dir) / "run.json", json.dumps(about | {_FIELD: str(file)}, indent=2) + "\n")
 
 
-def task_of_run(run_dir: str | Path, task: str, anew: str | None = None) -> Task:
-    """The task of that name as the run has it: where `anew` says, where its file lay, or as the name says.
+def task_of_run(run_dir: str | Path, task: str) -> Task:
+    """The task of that name as the run has it: from its file where that lay, if it is still there, or as the name says.
 
     From then on the name means that task in this process. Raises `TaskError` when there is none.
     """
     lay, file = _about(run_dir).get(_FIELD), resolve.file_of(task)
-    if anew is not None:
-        resolve.place(task, anew)
-    elif file is not None and isinstance(lay, str) and Path(lay).name == file.name and Path(lay).is_file():
+    if file is not None and isinstance(lay, str) and Path(lay).name == file.name and Path(lay).is_file():
         resolve.place(task, f"{lay}:{task.rpartition(':')[2]}")
+    return get_task(task)
+
+
+def moved(task: str, where: str) -> Task:
+    """The run's task `task`, which now is what `where` names, in whatever this process does with the run.
+
+    Raises `ConfigError` for a task that lies in no file or module, `TaskError` when there is none at `where`.
+    """
+    if ":" not in task:
+        raise ConfigError(f"task: expected it for a run whose task lies in a file or module, got {where} for {task}")
+    resolve.place(task, where)
     return get_task(task)
 
 
