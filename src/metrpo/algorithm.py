@@ -48,6 +48,7 @@ from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
 from metrpo.world import logged
 from metrpo.world.dataset import Dataset
+from metrpo.world.origin import relative, shifted
 from metrpo.world.registry import get_task, without_formulas
 from metrpo.world.task import Task
 
@@ -73,6 +74,11 @@ class State(NamedTuple):
     """Of the ensemble; its normaliser derives from the dataset."""
     baseline: Baseline
     dataset: Dataset
+
+    @property
+    def origin(self) -> np.ndarray:
+        """[S], float64: what the states are counted from that models and policy see (`world.origin`)."""
+        return self.dataset.origin
 
 
 def init(config: Config) -> State:
@@ -188,7 +194,7 @@ def _play(
     mean = partial(
         _perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise, inputs=inputs
     )
-    explorer = lambda rng: real.explore(mean(rng), config.collect, rng)  # noqa: E731
+    explorer = lambda rng: real.explore(_of_real(mean(rng), state.origin), config.collect, rng)  # noqa: E731
     # Each episode has randomness of its own, so that it is the same one after any interruption.
     rngs = (rng_of(config.seed, state.iteration + 1, Stage.COLLECT, number) for number in itertools.count(first))
     steps, longest = sum(len(e.rewards) for e in episodes), config.collect.steps
@@ -255,7 +261,7 @@ def learn(
     with clock("evaluate"):
         diagnosis = _diagnosis(config, task, following, ensemble)
         progress.stage("evaluate", config.evaluation_episodes)
-        returns = recorded_returns(config, task, policy, iteration)
+        returns = recorded_returns(config, task, policy, iteration, origin=dataset.origin)
         trust = _end_calibration(task, dataset, ensemble, iteration)
     collected = float(np.mean([e.rewards.sum() for e in episodes])) if episodes else math.nan
     row = _row(config, following, returns, collected, fitted, improved, phase.is_cut(config, task))
@@ -278,13 +284,18 @@ def recorded(what: str, iteration: int, record: Callable[[], T], failed: T) -> T
 
 
 def recorded_returns(
-    config: Config, task: Task, policy: Policy, iteration: int, stage: Stage = Stage.EVALUATE
+    config: Config,
+    task: Task,
+    policy: Policy,
+    iteration: int,
+    stage: Stage = Stage.EVALUATE,
+    origin: np.ndarray | None = None,
 ) -> np.ndarray:
     """As `evaluate`; one NaN where that fails."""
 
     def returns() -> np.ndarray:
         with naming("evaluate" if stage is Stage.EVALUATE else "validate", iteration):
-            return evaluate(config, task, policy, iteration, stage)
+            return evaluate(config, task, policy, iteration, stage, origin)
 
     return recorded("return_real", iteration, returns, np.array([math.nan]))
 
@@ -357,15 +368,16 @@ def _improve(
     if config.imagine.start == "reset":
         with naming("improve", iteration):
             starts = real.reset_states(task, max(config.validate.starts, phase.rollouts(config, task)), rng)
+        starts = relative(starts, dataset.origin).astype(np.float32)
 
     def oracle(policy: Policy) -> float:
         # A policy in which the environment fails is no improvement, and the next iteration has other starts. They are
         # others than the record's, which would else be a selected maximum.
-        return float(np.mean(recorded_returns(config, task, policy, iteration, Stage.ORACLE)))
+        return float(np.mean(recorded_returns(config, task, policy, iteration, Stage.ORACLE, dataset.origin)))
 
     return phase.improve(
         config,
-        task,
+        shifted(task, dataset.origin),
         ensemble,
         _with_std(config, state),
         state.baseline,
@@ -410,16 +422,31 @@ def task_for(config: Config) -> Task:
     return without_formulas(task) if config.learn_reward else task
 
 
-def evaluate(config: Config, task: Task, policy: Policy, iteration: int, stage: Stage = Stage.EVALUATE) -> np.ndarray:
+def evaluate(
+    config: Config,
+    task: Task,
+    policy: Policy,
+    iteration: int,
+    stage: Stage = Stage.EVALUATE,
+    origin: np.ndarray | None = None,
+) -> np.ndarray:
     """Real returns [config.evaluation_episodes] of the deterministic policy: a record, never used to learn.
+
+    The policy sees states less `origin` [S].
 
     Fewer where they have `EVALUATION_STEPS` together. One NaN for a task that only another program can play.
     """
     if not task.playable:
         return np.array([math.nan])
     seed = int(rng_of(config.seed, iteration, stage).integers(2**31))
-    act = partial(gaussian.mean, _host(policy))
+    act: real.Act = partial(gaussian.mean, _host(policy))
+    act = act if origin is None else _of_real(act, origin)
     return real.evaluate(task, act, config.evaluation_episodes, seed, EVALUATION_STEPS)
+
+
+def _of_real(act: real.Act, origin: np.ndarray) -> real.Act:
+    """`act`, which takes states counted from `origin`, for states as the environment gives them."""
+    return lambda state: act(relative(state, origin))
 
 
 def _perturbed(

@@ -13,6 +13,8 @@ from __future__ import annotations
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
+
 from metrpo import algorithm
 from metrpo.algorithm import State
 from metrpo.config import Config
@@ -113,7 +115,13 @@ def _settle(run_dir: str | Path, name: str, where: str | None) -> None:
 
 
 def _content(episode: Episode) -> tuple[bytes | bool, ...]:
-    return episode.states.tobytes(), episode.actions.tobytes(), episode.rewards.tobytes(), episode.terminated
+    # Files of earlier versions hold float32.
+    return (
+        np.asarray(episode.states, np.float64).tobytes(),
+        episode.actions.tobytes(),
+        episode.rewards.tobytes(),
+        episode.terminated,
+    )
 
 
 def _ours(config: Config) -> State:

@@ -15,7 +15,7 @@ class Episode(NamedTuple):
     """One real episode of L steps."""
 
     states: np.ndarray
-    """[L + 1, S], float32; the last one is the state after the last step."""
+    """[L + 1, S], float64 (float32 in old files): as the environment gave them; the last one is after the last step."""
     actions: np.ndarray
     """[L, A], float32, as executed: within [-1, 1]."""
     rewards: np.ndarray
@@ -28,7 +28,7 @@ class Transitions(NamedTuple):
     """n real transitions; on the device the arrays have a fixed capacity C >= n, so that growth never recompiles."""
 
     states: Array
-    """[C, S]"""
+    """[C, S], counted from the dataset's origin."""
     actions: Array
     """[C, A]"""
     deltas: Array

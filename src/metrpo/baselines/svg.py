@@ -189,7 +189,7 @@ def _value(value: Policy, normaliser: Normaliser, states: Array, time: Array) ->
 def _path(states: np.ndarray, drawn: np.ndarray, rewards: np.ndarray, horizon: int) -> Path:
     missing = horizon - len(rewards)
     return Path(
-        np.concatenate([states, np.repeat(states[-1:], missing, axis=0)]),
+        np.concatenate([states, np.repeat(states[-1:], missing, axis=0)]).astype(np.float32),
         np.concatenate([drawn, np.zeros((missing, drawn.shape[1]), np.float32)]),
         np.append(rewards, np.zeros(missing, np.float32)),
         (np.arange(horizon) < len(rewards)).astype(np.float32),

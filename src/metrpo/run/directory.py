@@ -224,7 +224,8 @@ class RunDirectory:
         result = self.rows[-1].get("return_real") if self.rows else None
         result = result if result is not None and math.isfinite(result) else None
         progress = (state.iteration, state.real_steps, result)
-        save_policy(self.path, state.policy, self.config.task, *progress, _interface(self.config.task))
+        origin = getattr(state, "origin", None)  # baselines have none
+        save_policy(self.path, state.policy, self.config.task, *progress, _interface(self.config.task), origin)
         if not self.rows:
             return
         title = f"{self.config.task}, {self.config.system}, {self.config.preset}, seed {self.config.seed}"

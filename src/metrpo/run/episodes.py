@@ -145,9 +145,17 @@ class EpisodeLog:
         for name, array in arrays.items():
             if array.shape != shapes[name] or steps == 0:
                 raise ValueError(f"{name}: expected shape {list(shapes[name])}, got {list(array.shape)}")
-            if array.dtype != (bool if name == "terminated" else np.float32) or not np.isfinite(array).all():
-                raise ValueError(f"{name}: expected finite numbers of float32, got {array.dtype} or others")
+            kinds: list[type] = {"terminated": [bool], "states": [np.float64, np.float32]}.get(name, [np.float32])
+            if array.dtype not in kinds or not _finite(array):
+                expected = np.dtype(kinds[0]).name
+                raise ValueError(f"{name}: expected finite numbers of {expected}, got {array.dtype} or others")
         return Episode(arrays["states"], arrays["actions"], arrays["rewards"], bool(arrays["terminated"]))
+
+
+def _finite(array: np.ndarray) -> bool:
+    """Whether all numbers are finite, also in float32, in which everything is learned."""
+    with np.errstate(over="ignore"):
+        return bool(np.isfinite(array.astype(np.float32)).all())
 
 
 def append_episode(
@@ -164,7 +172,8 @@ def append_episode(
     """
     info = load_policy(run_dir).info
     given = {"states": states, "actions": actions, "rewards": rewards}
-    arrays = {name: np.asarray(value, np.float32) for name, value in given.items()}
+    with np.errstate(over="ignore"):  # infinity is refused below
+        arrays = {n: np.asarray(value, np.float64 if n == "states" else np.float32) for n, value in given.items()}
     length = len(arrays["rewards"])
     shapes = {
         "states": (length + 1, info.observation_size),
@@ -175,7 +184,7 @@ def append_episode(
         if array.shape != shapes[name] or length == 0:
             expected = list(shapes[name]) if length else "at least one step"
             raise TaskError(f"append_episode: {name}: expected {expected}, got shape {list(array.shape)}")
-        if not np.isfinite(array).all():
+        if not _finite(array):
             raise TaskError(f"append_episode: {name}: expected finite numbers; cut the episode before the first other")
     beyond = float(np.abs(arrays["actions"]).max())
     if beyond > 1 + 1e-6:

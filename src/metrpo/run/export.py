@@ -95,7 +95,12 @@ def _python(policy: LoadedPolicy, source: Path) -> str:
     weights = b"".join(array.astype("<f4").tobytes() for layer in policy.layers for array in layer)
     example = np.random.default_rng(0).standard_normal(sizes[0]).round(3)
     info = _info(policy, source)
+    origin = policy.origin
+    example = example if origin is None else example + origin
     fields = {
+        "dtype": "float32" if origin is None else "float64",
+        "relative": "" if origin is None else _RELATIVE,
+        "origin": "" if origin is None else f"_ORIGIN = np.array({origin.tolist()})\n",
         **{name: _inside_docstring(info[name]) for name in ("task", "metrpo", "iteration", "real_steps")},
         "policy_sha256": info["policy_sha256"],
         "observation_size": sizes[0],
@@ -107,7 +112,7 @@ def _python(policy: LoadedPolicy, source: Path) -> str:
         "range": _range(info),
         "sha256": hashlib.sha256(weights).hexdigest(),
         "weights": "\n".join(textwrap.wrap(base64.b64encode(weights).decode(), 100)),
-        "example": _numbers(example),
+        "example": _numbers(example, 17),
         "action": _numbers(policy(example)),
     }
     return Template(_SOURCE).substitute(fields)
@@ -145,8 +150,8 @@ def _inside_docstring(value: Any) -> str:
     return ascii(str(value))[1:-1].replace('"', '\\"')
 
 
-def _numbers(array: np.ndarray) -> str:
-    return textwrap.fill(str([float(f"{x:.9g}") for x in array.tolist()]), 100, break_on_hyphens=False)
+def _numbers(array: np.ndarray, digits: int = 9) -> str:
+    return textwrap.fill(str([float(f"{x:.{digits}g}") for x in array.tolist()]), 100, break_on_hyphens=False)
 
 
 def _onnx(policy: LoadedPolicy, source: Path) -> bytes:
@@ -155,23 +160,34 @@ def _onnx(policy: LoadedPolicy, source: Path) -> bytes:
     except ImportError as error:
         raise MetrpoError("no package onnx: pip install 'metrpo[export]', or choose a .py or .npz") from error
     constants = {"low": np.asarray(-1.0), "high": np.asarray(1.0)}
-    nodes, value = [], "observation"
+    nodes, value, kind = [], "observation", TensorProto.FLOAT
+    if policy.origin is not None:
+        kind, value = TensorProto.DOUBLE, "relative"
+        nodes += [
+            helper.make_node("Sub", ["observation", "origin"], ["exact"]),
+            helper.make_node("Cast", ["exact"], [value], to=TensorProto.FLOAT),
+        ]
     for i, (weights, bias) in enumerate(policy.layers):
         constants |= {f"w{i}": weights, f"b{i}": bias}
         nodes.append(helper.make_node("Gemm", [value, f"w{i}", f"b{i}"], [f"sum{i}"]))
         nodes.append(helper.make_node("Tanh", [f"sum{i}"], [value := f"hidden{i}"]))
     nodes[-1] = helper.make_node("Clip", [f"sum{len(policy.layers) - 1}", "low", "high"], ["action"])
 
-    def end(name: str, size: int, text: str) -> Any:
-        return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size], doc_string=text)
+    def end(name: str, kind: int, size: int, text: str) -> Any:
+        return helper.make_tensor_value_info(name, kind, ["batch", size], doc_string=text)
 
-    observation = end("observation", len(policy.layers[0][0]), "Its parts in order: the metadata's observation.")
+    parts = "Its parts in order: the metadata's observation."
+    observation = end("observation", kind, len(policy.layers[0][0]), parts)
     units = "In [-1, 1], without noise; the environment's range: the metadata's action_low and action_high."
-    action = end("action", len(policy.layers[-1][1]), units)
+    action = end("action", TensorProto.FLOAT, len(policy.layers[-1][1]), units)
     tensors = [numpy_helper.from_array(array.astype(np.float32), name) for name, array in constants.items()]
+    if policy.origin is not None:
+        tensors.append(numpy_helper.from_array(policy.origin, "origin"))
     graph = helper.make_graph(nodes, "policy", [observation], [action], tensors, doc_string="A tanh network, clipped.")
     info = {name: _utf8(value) for name, value in _info(policy, source).items()}
     text = f"A policy for {info['task']}: observation [batch, S] to action [batch, A], float32."
+    if policy.origin is not None:
+        text += " The observation is float64: float32 could not hold it."
     origin = {"producer_name": "metrpo", "producer_version": info["metrpo"], "doc_string": text}
     model = helper.make_model_gen_version(graph, opset_imports=[helper.make_opsetid("", _OPSET)], **origin)
     helper.set_model_props(model, info)
@@ -185,6 +201,12 @@ def _utf8(value: Any) -> str:
 
 
 _WRITERS: dict[str, _Writer] = {".py": _python, ".onnx": _onnx, ".npz": lambda _, source: source.read_bytes()}
+
+_RELATIVE = """\
+    with np.errstate(over="ignore"):
+        hidden = (hidden - _ORIGIN).astype(np.float32)
+"""
+"""In the exported file, where observations have an origin."""
 
 _SOURCE = '''\
 """A trained control policy in one file: observations in, actions out. It needs NumPy and nothing else.
@@ -221,11 +243,11 @@ ACTION_HIGH = INFO["action_high"]
 def act(observation):
     """The action, in [-1, 1], float32: [S] -> [A] or [B, S] -> [B, A]; ValueError for other shapes, NaN or infinity."""
     with np.errstate(over="ignore"):
-        hidden = np.asarray(observation, dtype=np.float32)
+        hidden = np.asarray(observation, dtype=np.$dtype)
     if hidden.ndim not in (1, 2) or hidden.shape[-1] != OBSERVATION_SIZE:
         size = OBSERVATION_SIZE
         raise ValueError(f"observation: expected shape [{size}] or [B, {size}], got {list(hidden.shape)}")
-    if not np.isfinite(hidden).all():
+$relative    if not np.isfinite(hidden).all():
         at = np.argwhere(~np.isfinite(hidden))[0]
         raise ValueError(f"observation: expected finite numbers, got {hidden[tuple(at)]} at {at.tolist()}")
     for weights, bias in _LAYERS[:-1]:
@@ -269,7 +291,7 @@ def _layers(text):
     return layers
 
 
-_SIZES = $sizes
+${origin}_SIZES = $sizes
 _SHA256 = "$sha256"
 _LAYERS = _layers("""
 $weights

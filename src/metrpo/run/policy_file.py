@@ -88,6 +88,8 @@ class LoadedPolicy:
     info: PolicyInfo
     layers: tuple[tuple[np.ndarray, np.ndarray], ...]
     """Weights [in, out] and bias [out] of every layer."""
+    origin: np.ndarray | None = None
+    """[S], float64: what its observations are counted from, where that is not 0."""
 
     def __call__(self, observation: Any) -> np.ndarray:
         """The action, in [-1, 1], float32: [S] -> [A] or [B, S] -> [B, A].
@@ -95,10 +97,13 @@ class LoadedPolicy:
         Raises `ValueError` when the observation has another shape, or is not finite in float32.
         """
         with np.errstate(over="ignore"):
-            hidden = np.asarray(observation, dtype=np.float32)
+            hidden = np.asarray(observation, dtype=np.float32 if self.origin is None else np.float64)
         size = self.info.observation_size
         if hidden.ndim not in (1, 2) or hidden.shape[-1] != size:
             raise ValueError(f"observation: expected shape [{size}] or [B, {size}], got {list(hidden.shape)}")
+        if self.origin is not None:
+            with np.errstate(over="ignore"):
+                hidden = (hidden - self.origin).astype(np.float32)
         if not np.isfinite(hidden).all():
             at = np.argwhere(~np.isfinite(hidden))[0]
             raise ValueError(f"observation: expected finite numbers, got {hidden[tuple(at)]} at {at.tolist()}")
@@ -132,8 +137,11 @@ def save_policy(
     real_steps: int,
     return_real: float | None,
     interface: Interface | None = None,
+    origin: np.ndarray | None = None,
 ) -> None:
     """Writes `policy.npz` (weights and info) and `policy.json` (the info for people and other programs).
+
+    `origin` [S], float64, is what its observations are counted from.
 
     Raises `RunDirectoryError` when they cannot be written.
     """
@@ -142,7 +150,10 @@ def save_policy(
     info = PolicyInfo(task, layers[0][0].shape[0], layers[-1][0].shape[1], hidden, iteration, real_steps, return_real)
     info = with_interface(info, interface)
     arrays = {f"{kind}{i}": array for i, layer in enumerate(layers) for kind, array in zip("wb", layer, strict=True)}
-    write_arrays(directory / FILE, arrays | {"log_std": np.asarray(policy.log_std)}, {"policy": asdict(info)})
+    arrays["log_std"] = np.asarray(policy.log_std)
+    if origin is not None and origin.any():
+        arrays["origin"] = origin
+    write_arrays(directory / FILE, arrays, {"policy": asdict(info)})
     digest = hashlib.sha256((directory / FILE).read_bytes()).hexdigest()
     beside = {"format": FORMAT, "metrpo": metrpo_version(), **asdict(info), "file": FILE, "sha256": digest}
     atomic_write(directory / "policy.json", json.dumps(beside, indent=2) + "\n")
@@ -170,7 +181,7 @@ def load_policy(directory: str | Path) -> LoadedPolicy:
         raise RunDirectoryError(f"{directory} holds no policy: {_where_else(path)}")
     arrays, meta = read_arrays(path)
     info = _info(meta.get("policy", {}), path)
-    return LoadedPolicy(info, _layers(info, arrays, path))
+    return LoadedPolicy(info, _layers(info, arrays, path), arrays.get("origin"))
 
 
 def _where_else(path: Path) -> str:
@@ -241,6 +252,8 @@ def _layers(
     expected: dict[str, tuple[int, ...]] = {"log_std": (info.action_size,)}
     for i, (inputs, outputs) in enumerate(pairwise(sizes)):
         expected |= {f"w{i}": (inputs, outputs), f"b{i}": (outputs,)}
+    if "origin" in arrays:
+        expected["origin"] = (info.observation_size,)
     wrong = [f"{name} is missing" for name in expected if name not in arrays]
     wrong += [f"got {brief(name)} besides" for name in arrays if name not in expected]
     wrong += [
@@ -251,8 +264,9 @@ def _layers(
     if wrong:
         raise RunDirectoryError(f"{path}: expected weights and biases of shapes that fit its sizes; {wrong[0]}")
     for name, array in arrays.items():
-        if array.dtype != np.float32:
-            raise RunDirectoryError(f"{path}: {name}: expected float32, got {array.dtype}")
+        kind = np.float64 if name == "origin" else np.float32
+        if array.dtype != kind:
+            raise RunDirectoryError(f"{path}: {name}: expected {np.dtype(kind)}, got {array.dtype}")
         if not np.isfinite(array).all():
             raise RunDirectoryError(
                 f"{path}: expected finite weights, got infinite or NaN in {name}; take an earlier one"

@@ -105,7 +105,7 @@ def evaluate(task: Task, act: Act, episodes: int, seed: int, at_most: int | None
 
 
 def reset_states(task: Task, count: int, rng: np.random.Generator) -> np.ndarray:
-    """States [count, S] of fresh resets (real interaction that nobody counts: `imagine.start = "reset"`).
+    """States [count, S], float64, of fresh resets (real interaction that nobody counts: `imagine.start = "reset"`).
 
     Resets that give NaN or infinity are left out, as in `collect`.
     """
@@ -117,7 +117,7 @@ def reset_states(task: Task, count: int, rng: np.random.Generator) -> np.ndarray
             except NotFiniteError as error:
                 failed += 1
                 leave_out(failed, error)
-    return np.array(states, np.float32)
+    return np.array(states, np.float64)
 
 
 def explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
@@ -163,7 +163,7 @@ def _episode(
         actions.append(action)
         rewards.append(reward)
     return Episode(
-        np.array(states, np.float32), np.array(actions, np.float32), np.array(rewards, np.float32), terminated
+        np.array(states, np.float64), np.array(actions, np.float32), np.array(rewards, np.float32), terminated
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from metrpo.config import CollectConfig
 from metrpo.types import Episode, Transitions
+from metrpo.world.origin import origin_of, relative
 
 ROOM = 640 << 20
 """Bytes of transitions for which room is made at once: 200,000 of the widest of Gymnasium's robots."""
@@ -19,7 +20,9 @@ class Dataset(NamedTuple):
     train: Transitions
     validation: Transitions
     starts: np.ndarray
-    """[E, S], the first states of all real episodes: where imagined episodes start."""
+    """[E, S], the first states of all real episodes, counted from the origin: where imagined episodes start."""
+    origin: np.ndarray
+    """[S], float64: what states are counted from (`world.origin`); the first data decide it."""
 
 
 def empty(state_size: int, action_size: int, learned: int = 0) -> Dataset:
@@ -31,7 +34,7 @@ def empty(state_size: int, action_size: int, learned: int = 0) -> Dataset:
         )
         return Transitions(states, actions, deltas, 0)
 
-    return Dataset(none(), none(), np.zeros((0, state_size), np.float32))
+    return Dataset(none(), none(), np.zeros((0, state_size), np.float32), np.zeros(state_size))
 
 
 def add(
@@ -47,6 +50,9 @@ def add(
 
     Both sets get at least one episode where there are two, so that a first, short collection can be validated.
     """
+    origin = dataset.origin
+    if episodes and not len(dataset.starts):
+        origin = origin_of(np.concatenate([e.states for e in episodes]))
     order = rng.permutation(len(episodes))
     held_out = min(max(1, round(config.validation_fraction * len(episodes))), len(episodes) - 1)
     validation = [episodes[i] for i in order[:held_out]]
@@ -54,9 +60,10 @@ def add(
     # A single first episode serves for both: there is nothing else to validate on.
     validation = validation or ([] if dataset.validation.size else train)
     return Dataset(
-        append(dataset.train, train, config.max_train, learned),
-        append(dataset.validation, validation, config.max_validation, learned),
-        np.concatenate([dataset.starts, *(e.states[:1] for e in episodes)]),
+        append(dataset.train, train, config.max_train, learned, origin),
+        append(dataset.validation, validation, config.max_validation, learned, origin),
+        np.concatenate([dataset.starts, *(_counted_from(origin, e)[:1].astype(np.float32) for e in episodes)]),
+        origin,
     )
 
 
@@ -85,16 +92,31 @@ def _capacity(transitions: Transitions, most: int) -> int:
     return min(capacity, most)
 
 
-def append(old: Transitions, episodes: list[Episode], most: int, learned: tuple[str, ...] = ()) -> Transitions:
-    """The transitions with those of `episodes` added; of more than `most` the oldest go."""
-    states = np.concatenate([old.states, *(e.states[:-1] for e in episodes)])[-most:]
+def append(
+    old: Transitions,
+    episodes: list[Episode],
+    most: int,
+    learned: tuple[str, ...] = (),
+    origin: np.ndarray | None = None,
+) -> Transitions:
+    """The transitions with those of `episodes` added, counted from `origin`; of more than `most` the oldest go."""
+    exact = [e.states.astype(np.float32) if origin is None else _counted_from(origin, e) for e in episodes]
+    states = np.concatenate([old.states, *(x[:-1].astype(np.float32) for x in exact)])[-most:]
     actions = np.concatenate([old.actions, *(e.actions for e in episodes)])[-most:]
-    deltas = np.concatenate([old.deltas, *(_deltas(e, learned) for e in episodes)])[-most:]
+    changes = [_deltas(x, e, learned) for x, e in zip(exact, episodes, strict=True)]
+    deltas = np.concatenate([old.deltas, *changes])[-most:]
     return Transitions(states, actions, deltas, len(states))
 
 
-def _deltas(episode: Episode, learned: tuple[str, ...]) -> np.ndarray:
+def _counted_from(origin: np.ndarray, episode: Episode) -> np.ndarray:
+    """[L + 1, S], float64. Where there is no origin the numbers are those of float32, which deltas then add up to."""
+    exact = relative(episode.states, origin)
+    return np.where(origin != 0, exact, exact.astype(np.float32)).astype(np.float64)
+
+
+def _deltas(states: np.ndarray, episode: Episode, learned: tuple[str, ...]) -> np.ndarray:
     ends = np.zeros_like(episode.rewards)
     ends[-1] = episode.terminated
     columns = {"reward": episode.rewards, "end": ends}
-    return np.column_stack([np.diff(episode.states, axis=0), *(columns[name] for name in learned)])
+    change = np.diff(states, axis=0).astype(np.float32)
+    return np.column_stack([change, *(columns[name] for name in learned)])

@@ -10,6 +10,7 @@ from metrpo.errors import TaskError
 from metrpo.types import Episode
 from metrpo.untrusted import arrays_of, opened
 from metrpo.world import minari_log
+from metrpo.world.origin import origin_of, relative
 from metrpo.world.task import Task
 
 ARRAYS = ("states", "actions", "rewards", "next_states", "terminated")
@@ -55,9 +56,13 @@ def _check(name: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
 
 
 def _episodes(found: dict[str, np.ndarray]) -> list[Episode]:
-    arrays = {name: found[name].astype(np.float32) for name in ARRAYS[:4]}
+    kinds = {"states": np.float64, "next_states": np.float64}
+    arrays = {name: found[name].astype(kinds.get(name, np.float32)) for name in ARRAYS[:4]}
     ended = found["terminated"].astype(bool)
-    broken = np.any(arrays["next_states"][:-1] != arrays["states"][1:], axis=1)
+    # The same state may have been written twice with another rounding.
+    origin = origin_of(arrays["states"])
+    starts, ends_in = (relative(arrays[name], origin).astype(np.float32) for name in kinds)
+    broken = np.any(ends_in[:-1] != starts[1:], axis=1)
     ends = np.flatnonzero(np.append(broken | ended[:-1], True)) + 1
     episodes = []
     for first, last in zip(np.append(0, ends[:-1]), ends, strict=True):

@@ -59,7 +59,7 @@ def _episode(episode: Any, space: Any, bounds: Box) -> Episode:
     low, high = bounds.low.ravel(), bounds.high.ravel()
     actions = 2 * (np.reshape(episode.actions, (steps, -1)) - low) / (high - low) - 1
     return Episode(
-        states.astype(np.float32),
+        states.astype(np.float64),
         np.clip(actions, -1, 1).astype(np.float32),
         np.asarray(episode.rewards, np.float32),
         bool(episode.terminations[-1]),
