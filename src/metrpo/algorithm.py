@@ -26,7 +26,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import jax
 import numpy as np
 
-from metrpo import phase
+from metrpo import phase, scales
 from metrpo.config import Config
 from metrpo.errors import ConfigError, DivergedError, EpisodeError, MetrpoError, NotFiniteError
 from metrpo.finite import naming, require_finite
@@ -237,6 +237,8 @@ def learn(
     rng = rng_of(config.seed, iteration, Stage.SPLIT)
     dataset = datasets.add(state.dataset, episodes, config.collect, rng, task.learned)
     require_finite("collect", iteration, "leave out the episode that holds it", dataset=dataset)
+    if state.iteration == 0:
+        scales.warn(config, task, dataset, episodes)
     with clock("fit"):
         progress.stage("fit", None)
         ensemble, fitted = _fit(config, task, state.networks, dataset, iteration, progress)

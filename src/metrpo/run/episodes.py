@@ -28,6 +28,8 @@ from metrpo.types import Episode
 from metrpo.untrusted import brief, json_of, text_of
 
 _log = logging.getLogger("metrpo")
+_KINDS: dict[str, tuple[Any, ...]] = {"terminated": (bool,), "states": (np.float64, np.float32)}
+"""Of numbers in the files; all others are float32, as states were in earlier versions."""
 
 
 class EpisodeLog:
@@ -145,7 +147,7 @@ class EpisodeLog:
         for name, array in arrays.items():
             if array.shape != shapes[name] or steps == 0:
                 raise ValueError(f"{name}: expected shape {list(shapes[name])}, got {list(array.shape)}")
-            kinds: list[type] = {"terminated": [bool], "states": [np.float64, np.float32]}.get(name, [np.float32])
+            kinds = _KINDS.get(name, (np.float32,))
             if array.dtype not in kinds or not _finite(array):
                 expected = np.dtype(kinds[0]).name
                 raise ValueError(f"{name}: expected finite numbers of {expected}, got {array.dtype} or others")
