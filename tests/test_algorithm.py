@@ -460,7 +460,7 @@ def test_where_episodes_are_cut_both_policies_are_held_against_the_same_value(ti
 def test_the_oracle_plays_other_starts_than_the_record(tiny, monkeypatch):
     seeds = []
 
-    def evaluate(task, act, episodes, seed):
+    def evaluate(task, act, episodes, seed, *_):
         seeds.append(seed)
         return np.arange(episodes, dtype=float)
 

@@ -110,6 +110,8 @@ def improve(
         if verdict:
             accepted, reference, kept, accepted_at = policy, found, memory.baseline, updates
         on_validation(updates, accepted_at, float(np.mean(reference.values)))
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jax.device_get(kept))):
+        kept = memory.baseline  # what the run was resumed with is no place to go back to
     improve_info, imagine_info = jax.tree.map(lambda *xs: np.concatenate(xs), *infos)
     return (
         raw(accepted),
@@ -213,7 +215,7 @@ def _updates(
     memory: Memory,
     starts: np.ndarray,
     key: Array,
-    inputs: Inputs | None,
+    inputs: Inputs | None = None,
 ) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
     # What cannot change the compiled code (seed, budget, ...) must not cause a compilation: it is set to a constant.
     relevant = Config(
