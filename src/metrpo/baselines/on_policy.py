@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.types import Episode
 from metrpo.world import collect as real
+from metrpo.world import together
 from metrpo.world.task import Task
 
 
@@ -30,7 +32,12 @@ def collect(
     on_episode: real.OnEpisode = lambda steps: None,
     longest: int | None = None,
 ) -> Drawn:
-    """Whole episodes of `at_least` steps together, acting by samples of `policy` (see `world.collect.collect`)."""
+    """Whole episodes of `at_least` steps together, acting by samples of `policy` (see `world.collect.collect`).
+
+    Those of the paper's tasks are played many at a time (`world.together`).
+    """
+    if together.applies(task) and (longest is None or longest >= task.horizon):
+        return _together(task, policy, at_least, rng, on_episode)
     host = jax.tree.map(np.asarray, policy)
     std, drawn, actions = np.exp(host.log_std), list[list[np.ndarray]](), list[np.ndarray]()
 
@@ -50,3 +57,27 @@ def collect(
 
     episodes = real.collect(task, draw_act, at_least, rng, keep, longest)
     return Drawn(episodes, [np.array(actions, np.float32) for actions in drawn])
+
+
+def _together(
+    task: Task, policy: Policy, at_least: int, rng: np.random.Generator, on_steps: Callable[[int], None]
+) -> Drawn:
+    """Each episode has a seed and noise of its own, so that it is the same one however many are played at a time."""
+    host = jax.tree.map(np.asarray, policy)
+    std, noise, drawn = np.exp(host.log_std), list[np.ndarray](), list[np.ndarray]()
+
+    def seeds() -> Iterator[int]:
+        while True:
+            noise.append(std * np.random.default_rng(real.seed_of(rng)).standard_normal((task.horizon, len(std))))
+            drawn.append(np.empty((task.horizon, len(std)), np.float32))
+            yield real.seed_of(rng)
+
+    def act(states: np.ndarray, numbers: np.ndarray, steps: np.ndarray) -> np.ndarray:
+        actions = gaussian.mean(host, states)
+        for i, (number, step) in enumerate(zip(numbers, steps, strict=True)):
+            actions[i] += noise[number][step]
+            drawn[number][step] = actions[i]
+        return actions
+
+    episodes = together.play(task, act, seeds(), at_least, on_steps)
+    return Drawn(episodes, [actions[: len(e.rewards)] for actions, e in zip(drawn, episodes, strict=True)])

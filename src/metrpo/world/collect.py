@@ -86,7 +86,7 @@ def play(
     """
     with returned.closing(task.make_env(), task.name) as env:
         for rng in rngs:
-            yield _episode(task, env, draw_act(rng), _seed(rng), longest, on_step)
+            yield _episode(task, env, draw_act(rng), seed_of(rng), longest, on_step)
 
 
 def evaluate(task: Task, act: Act, episodes: int, seed: int, at_most: int | None = None) -> np.ndarray:
@@ -98,7 +98,7 @@ def evaluate(task: Task, act: Act, episodes: int, seed: int, at_most: int | None
     returns, steps = list[float](), 0
     with returned.closing(task.make_env(), task.name) as env:
         while len(returns) < episodes and (at_most is None or steps < at_most):
-            rewards = _episode(task, env, act, _seed(rng)).rewards
+            rewards = _episode(task, env, act, seed_of(rng)).rewards
             returns.append(rewards.sum(dtype=np.float64))
             steps += len(rewards)
     return np.array(returns)
@@ -113,7 +113,7 @@ def reset_states(task: Task, count: int, rng: np.random.Generator) -> np.ndarray
     with returned.closing(task.make_env(), task.name) as env:
         while len(states) < count:
             try:
-                states.append(_start(task, env, _seed(rng)))
+                states.append(_start(task, env, seed_of(rng)))
             except NotFiniteError as error:
                 failed += 1
                 leave_out(failed, error)
@@ -221,5 +221,6 @@ def _numbers(task: Task, where: str, observation: Any, reward: float) -> np.ndar
     return state
 
 
-def _seed(rng: np.random.Generator) -> int:
+def seed_of(rng: np.random.Generator) -> int:
+    """The seed of an episode's reset."""
     return int(rng.integers(2**31))

@@ -74,13 +74,19 @@ def _rllab_contacts(spec: mujoco.MjSpec) -> None:
 
 def _com_state(position: str, velocity: str, first: int) -> _StateOf:
     """State [COM axes, q[first:], v axes, q'[first:]]; the COM replaces the coordinates of the root body."""
-    axes, rates = (["xyz".index(axis) for axis in names] for names in (position, velocity))
+    axes, rates = _axes(position), _axes(velocity)
 
     def state(_: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
         com, com_velocity = data.subtree_com[_ROOT], data.subtree_linvel[_ROOT]
         return np.concatenate([com[axes], data.qpos[first:], com_velocity[rates], data.qvel[first:]])
 
     return state
+
+
+def _axes(names: str) -> slice:
+    """Of a vector [3]; a slice, for a list of indices takes ten times as long."""
+    first, last = "xyz".index(names[0]), "xyz".index(names[-1])
+    return slice(first, last + 1, 2 if names == "xz" else 1)
 
 
 def _humanoid_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
@@ -236,6 +242,11 @@ _add(_HUMANOID, "Humanoid", (47, 17), humanoid_reward, (), "keep the head at 1.5
 _add(_LYING, "HumanoidStandup", (47, 17), humanoid_reward, (), "bring the head to 1.5 m, starting on the floor")
 
 
+def is_robot(name: str) -> bool:
+    """Whether `name` is one of this file's tasks."""
+    return name in _ROBOTS
+
+
 # ---------------------------------------------------------------- the environment
 
 
@@ -309,12 +320,13 @@ class MujocoTask(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
 
     Observation [S] float64, unbounded; action [A] float32 in [-1, 1], clipped to it, then scaled to the motors' control
     range. A reset draws q = q0 + 0.01 N and q' = 0 + 0.1 N (rllab). The time limit comes from Gymnasium's registration.
-    `model` and `data` are MuJoCo's own. Raises `TaskError` for an unknown task and where frames cannot be rendered.
+    `model` and `data` are MuJoCo's own; environments of one task may share the model.
+    Raises `TaskError` for an unknown task and where frames cannot be rendered.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium reads it from the class)
 
-    def __init__(self, task: str, render_mode: str | None = None) -> None:
+    def __init__(self, task: str, render_mode: str | None = None, model: mujoco.MjModel | None = None) -> None:
         if render_mode not in (None, "rgb_array"):
             raise TaskError(f'render_mode: expected None or "rgb_array", got {render_mode!r}')
         self.task = get_task(task)
@@ -323,7 +335,7 @@ class MujocoTask(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         # Every task of this file has formulas.
         self._reward: Any = self.task.reward
         self._terminated: Any = self.task.terminated
-        self.model = _compile(self._robot)
+        self.model = _compile(self._robot) if model is None else model
         self.data = mujoco.MjData(self.model)
         self.metadata = {**self.metadata, "render_fps": round(1 / (self._robot.timestep * self._robot.frame_skip))}
         self._start = self.model.qpos0.copy()
@@ -355,14 +367,24 @@ class MujocoTask(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
             raise TaskError(
                 f"{self.task.name}: expected {self.task.action_size} finite numbers as action, got {action}"
             )
-        self.data.ctrl[:] = self._control_low + 0.5 * (action + 1.0) * self._control_span
-        mujoco.mj_step(self.model, self.data, self._robot.frame_skip)
-        state, self._state = self._state, self._observe()
+        state = self._state
+        self.advance(self.controls(action))
         if not np.isfinite(self._state).all():
             raise TaskError(f"{self.task.name}: the simulation diverged; reset() starts a new episode")
         reward = float(self._reward(state, action, self._state))
         terminated = self._terminated is not None and bool(self._terminated(self._state))
         return self._state.copy(), reward, terminated, False, {}
+
+    def controls(self, action: NDArray[Any]) -> NDArray[np.float64]:
+        """The motors' controls for actions in [-1, 1], [..., A]."""
+        return self._control_low + 0.5 * (action + 1.0) * self._control_span
+
+    def advance(self, controls: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Only the physics of a step: the state [S] after one control interval. Lets other threads run meanwhile."""
+        self.data.ctrl[:] = controls
+        mujoco.mj_step(self.model, self.data, self._robot.frame_skip)
+        self._state = self._observe()
+        return self._state
 
     def _observe(self) -> NDArray[np.float64]:
         # mj_step leaves positions and velocities of bodies as they were before its last integration.
