@@ -28,7 +28,8 @@ from metrpo.world.registry import get_task, register
 from metrpo.world.task import Task
 
 _Reward = Callable[[Array, Array, Array], Array]
-_StateOf = Callable[[mujoco.MjModel, mujoco.MjData], NDArray[np.float64]]
+_StateOf = Callable[[mujoco.MjModel, Any], NDArray[np.float64]]
+"""Of a model and its data, or of what stands for the data of many steps (`metrpo.world.open_loop`)."""
 
 _ROOT = 1
 """Body 0 is the world; body 1 carries the whole robot, so its subtree is the robot."""
@@ -76,9 +77,10 @@ def _com_state(position: str, velocity: str, first: int) -> _StateOf:
     """State [COM axes, q[first:], v axes, q'[first:]]; the COM replaces the coordinates of the root body."""
     axes, rates = _axes(position), _axes(velocity)
 
-    def state(_: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
+    def state(_: mujoco.MjModel, data: Any) -> NDArray[np.float64]:
         com, com_velocity = data.subtree_com[_ROOT], data.subtree_linvel[_ROOT]
-        return np.concatenate([com[axes], data.qpos[first:], com_velocity[rates], data.qvel[first:]])
+        parts = (com[..., axes], data.qpos[..., first:], com_velocity[..., rates], data.qvel[..., first:])
+        return np.concatenate(parts, axis=-1)
 
     return state
 
@@ -89,9 +91,9 @@ def _axes(names: str) -> slice:
     return slice(first, last + 1, 2 if names == "xz" else 1)
 
 
-def _humanoid_state(model: mujoco.MjModel, data: mujoco.MjData) -> NDArray[np.float64]:
+def _humanoid_state(model: mujoco.MjModel, data: Any) -> NDArray[np.float64]:
     """State [q[3:], q', head xyz], the head being the centre of its sphere, as in the authors' code."""
-    return np.concatenate([data.qpos[3:], data.qvel, data.geom_xpos[model.geom("head").id]])
+    return np.concatenate([data.qpos[..., 3:], data.qvel, data.geom_xpos[model.geom("head").id]], axis=-1)
 
 
 # ---------------------------------------------------------------- rewards and termination, NumPy and JAX alike
@@ -250,8 +252,8 @@ def is_robot(name: str) -> bool:
 # ---------------------------------------------------------------- the environment
 
 
-def _compile(robot: _Robot) -> mujoco.MjModel:
-    """The robot's physics: Gymnasium's body with rllab's numbers."""
+def _compile(robot: _Robot, sensors: bool = False) -> mujoco.MjModel:
+    """The robot's physics: Gymnasium's body with rllab's numbers; with `sensors`, of its COM, v and head."""
     path = resources.files("gymnasium") / "envs" / "mujoco" / "assets" / robot.asset
     if not path.is_file():
         raise TaskError(f"expected a robot's body at {path}, found none: reinstall gymnasium (1.2 or newer has it)")
@@ -262,12 +264,32 @@ def _compile(robot: _Robot) -> mujoco.MjModel:
         joint = actuator.target.removeprefix("left_").removeprefix("right_")
         actuator.gear[0] = robot.gears.get(joint, actuator.gear[0])
     spec.option.timestep, spec.option.integrator = robot.timestep, robot.integrator
+    if sensors:
+        _add_sensors(spec)
     # MuJoCo would restart a diverged simulation from q0 in silence, and the jump would pass for dynamics.
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     with warnings.catch_warnings():
         # MuJoCo deprecates an attribute of Gymnasium's cheetah and still obeys it: nothing for a user to act on.
         warnings.filterwarnings("ignore", message=".*settotalmass")
         return spec.compile()
+
+
+SENSORS = {"com": mujoco.mjtSensor.mjSENS_SUBTREECOM, "velocity": mujoco.mjtSensor.mjSENS_SUBTREELINVEL}
+"""What a state takes from the data besides q and q', of the whole robot; a head's position comes to it."""
+
+
+def _add_sensors(spec: mujoco.MjSpec) -> None:
+    robot, body = spec.bodies[_ROOT].name, mujoco.mjtObj.mjOBJ_BODY
+    for name, kind in SENSORS.items():
+        spec.add_sensor(name=name, type=kind, objtype=body, objname=robot)
+    if any(geom.name == "head" for geom in spec.geoms):
+        kind, geom = mujoco.mjtSensor.mjSENS_FRAMEPOS, mujoco.mjtObj.mjOBJ_GEOM
+        spec.add_sensor(name="head", type=kind, objtype=geom, objname="head")
+
+
+def robot_of(name: str) -> tuple[_Robot, mujoco.MjModel]:
+    """One of this file's robots with its physics and `SENSORS`."""
+    return _ROBOTS[name], _compile(_ROBOTS[name], sensors=True)
 
 
 class _Painter:
