@@ -57,8 +57,8 @@ def findings(config: Config, task: Task, dataset: Dataset, episodes: list[Episod
     states = dataset.train.states[-_ROWS:].astype(np.float64)
     if not len(states):
         return []
-    change, exact = _change(dataset, episodes), np.concatenate([dataset.origin + states, *(e.states for e in episodes)])
-    checks = (_coarse(states, change), _rounded(dataset.origin, exact, change), _exploded(states))
+    change = _change(dataset, episodes)
+    checks = (_coarse(states, change), _rounded(dataset.origin, episodes, change), _exploded(states))
     unnormalised = () if config.policy.normalise else (_far_from_1(states, task), _hidden(config, states, task))
     return [found for found in (*checks, *unnormalised) if found.dimensions]
 
@@ -87,8 +87,9 @@ def _coarse(states: np.ndarray, change: np.ndarray) -> Found:
     )
 
 
-def _rounded(origin: np.ndarray, exact: np.ndarray, change: np.ndarray) -> Found:
+def _rounded(origin: np.ndarray, episodes: list[Episode], change: np.ndarray) -> Found:
     """Where there is an origin, but what was observed came in float32: the digits were lost before."""
+    exact = np.concatenate([e.states for e in episodes] or [origin[None]])
     apart = _apart(np.abs(exact).max(axis=0))
     in_float32 = np.all(exact == exact.astype(np.float32), axis=0)
     dimensions = _where((origin != 0) & in_float32 & (change > 0) & (apart > COARSE * change))
