@@ -148,10 +148,10 @@ def test_the_step_is_the_natural_gradient_of_length_max_kl():
 
 
 def slow_penalty(policy, batch):
-    """The squared excess of mean actions beyond [-1, 1], summed over actions, mean over the steps that count."""
+    """The squared excess of mean actions beyond 0.9, summed over actions, mean over the steps that count."""
     states = batch.states[batch.mask > 0]
     means = np.array([slow_mean(policy, s) for s in states])
-    return np.mean(np.sum(np.maximum(np.abs(means) - 1, 0) ** 2, axis=1))
+    return np.mean(np.sum(np.maximum(np.abs(means) - 0.9, 0) ** 2, axis=1))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -179,7 +179,7 @@ def test_the_penalty_alone_leads_saturated_means_back():
         return float(now.layers[0][1][0])
 
     assert after(5, 0.0) == 3.0, "no gradient, no step"
-    assert after(40, 0.05) == pytest.approx(1.0, abs=0.05)
+    assert 0.5 < after(40, 0.05) < 0.95, "steps of a fixed length end near the limit, not on it"
 
 
 def test_a_gaussian_bandit_moves_as_the_closed_form_says():

@@ -239,7 +239,7 @@ def test_the_optimum_is_found_and_the_preset_is_the_first_trial(tmp_path):
     found = tune(search(20), tmp_path, 1, silent, Fake())
     assert [r.number for r in found.records] == list(range(20))
     assert [r.usual for r in found.records] == [True] + [False] * 19
-    assert found.records[0].settings == {"trpo.max_kl": 0.03, "ensemble.members": 5}
+    assert found.records[0].settings == {"trpo.max_kl": 0.01, "ensemble.members": 5}
     assert found.best.settings["ensemble.members"] == 3
     assert 0.05 < found.best.settings["trpo.max_kl"] < 0.2
     run = found.search.runs(found.best.number, found.best.settings)[0]
@@ -466,7 +466,7 @@ def test_the_command_ends_with_a_table_a_picture_and_the_best_command(tmp_path, 
 def test_a_dry_run_writes_nothing(tmp_path, faked, capsys):
     assert cli.main(command(tmp_path / "none", "--dry-run")) == 0
     said = capsys.readouterr().out
-    assert "trpo.max_kl = log 0.001..1.0 (the preset has 0.03)" in said
+    assert "trpo.max_kl = log 0.001..1.0 (the preset has 0.01)" in said
     assert "metrpo train Swimmer --system me-trpo" in said
     assert not (tmp_path / "none").exists()
     assert faked.begun == []

@@ -22,7 +22,7 @@ def clipped_surrogate(
 ) -> Array:
     """sum of min(ratio A, clip(ratio, 1 - clip, 1 + clip) A) over the steps of `batch` (their equation 7).
 
-    Less `penalty` times the squared excess of mean actions beyond [-1, 1].
+    Less `penalty` times the squared excess of mean actions beyond 0.9.
     """
     means = gaussian.mean(policy, batch.states)
     log_probability = gaussian.log_probability(means, policy.log_std, batch.actions)

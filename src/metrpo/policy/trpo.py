@@ -23,7 +23,7 @@ def improve(
 ) -> tuple[Policy, ImproveInfo]:
     """One TRPO update on `batch`; the policy stays as it is when no step of the line search improves within max_kl.
 
-    The surrogate loses `penalty` times the squared excess of mean actions beyond [-1, 1]: clipped actions have no
+    The surrogate loses `penalty` times the squared excess of mean actions beyond 0.9: clipped actions have no
     gradient that could bring them back. With `axis`, `batch` is this device's share of the batch (see
     `metrpo.devices`).
     """

@@ -19,7 +19,7 @@ from metrpo.types import Array
 def objective(policy: Policy, batch: Batch, count: Array, penalty: float = 0.0) -> Array:
     """sum of advantage x log pi(a | s), over `count`: its gradient at the policy that acted is the policy gradient.
 
-    Less `penalty` times the squared excess of mean actions beyond [-1, 1].
+    Less `penalty` times the squared excess of mean actions beyond 0.9.
     """
     means = gaussian.mean(policy, batch.states)
     gain = batch.advantages * gaussian.log_probability(means, policy.log_std, batch.actions)
