@@ -65,7 +65,7 @@ def phases(config: Config, state: algorithm.State, count: int, fresh: bool, vari
     for number in range(1, count + 1):
         policy, baseline, info = algorithm._improve(config, task, state, data, ensemble, number, SILENT, Clock())
         state = state._replace(policy=policy, baseline=baseline)
-        earned = float(np.mean(algorithm.evaluate(config, task, policy, number)))
+        earned = float(np.mean(algorithm.evaluate(config, task, policy, number, origin=state.origin)))
         horizon, key = phase.imagined_horizon(config, task), jax.random.key(seed)
         saturated = diagnose(ensemble, policy, data.validation, data.train, horizon, key).saturated
         std = float(np.mean(np.exp(np.asarray(policy.log_std))))
