@@ -38,7 +38,7 @@ def test_episodes_that_end_early_count_by_their_length():
 
 def test_states_actions_and_rewards_belong_together():
     for e in collect(max_std=3.0):
-        assert {x.dtype for x in e[:3]} == {np.dtype(np.float32)}
+        assert [x.dtype for x in e[:3]] == [np.float64, np.float32, np.float32]
         assert (len(e.states), len(e.actions)) == (21, 20)
         np.testing.assert_allclose(e.states[1:], e.states[:-1] @ probe.A.T + e.actions @ probe.B.T, atol=1e-5)
         np.testing.assert_allclose(e.rewards, probe.reward(e.states[:-1], e.actions, e.states[1:]), rtol=1e-4)
@@ -168,7 +168,7 @@ def test_the_probes_optimum_is_the_riccati_return():
 
 def test_reset_states_are_fresh_starts():
     states = real.reset_states(probe.PROBE, 300, np.random.default_rng(0))
-    assert (states.shape, states.dtype) == ((300, 2), np.float32)
+    assert (states.shape, states.dtype) == ((300, 2), np.float64)
     assert len(np.unique(states, axis=0)) == 300
     assert stats.kstest(states.ravel(), stats.uniform(-probe.START, 2 * probe.START).cdf).pvalue > 1e-3
     np.testing.assert_array_equal(states, real.reset_states(probe.PROBE, 300, np.random.default_rng(0)))

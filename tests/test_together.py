@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
+from functools import partial
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import probe
 from helpers import random_policy
 from metrpo.baselines import on_policy
-from metrpo.errors import DivergedError, TaskError
-from metrpo.world import mujoco, together
+from metrpo.errors import DivergedError, EpisodeError, TaskError
+from metrpo.policy import gaussian
+from metrpo.world import collect, mujoco, together
 from metrpo.world.registry import get_task
 
 NAMES = ["Swimmer", "Snake", "Hopper", "HopperUpright", "HalfCheetah", "Ant", "Humanoid", "HumanoidStandup"]
-
-
-def one_by_one(task):
-    """The task through its Gymnasium environment."""
-    return dataclasses.replace(task, make=dataclasses.replace(task).make_env)
 
 
 def noisy(task, std=1.0):
@@ -57,18 +56,40 @@ def test_side_by_side_is_the_environment_step_by_step(name):
         np.testing.assert_array_equal(episode.rewards, np.array(rewards, np.float32))
 
 
-@pytest.mark.parametrize("slots", [1, 3])
-@pytest.mark.parametrize("at_least", [1, 100, 130, 450])
-def test_as_many_episodes_as_one_after_another(monkeypatch, slots, at_least):
+def one_after_another(task, seeds, at_least, longest=None):
+    """The same by `collect.play`, whose generators give the seeds."""
+
+    class Given:
+        def __init__(self, seed):
+            self.seed = seed
+
+        def integers(self, _):
+            return self.seed
+
+    noise, episodes = noisy(task, 3.0), []
+
+    def draw_act(rng):
+        number, steps = np.array([len(episodes)]), itertools.count()
+        return lambda state: noise(state[None], number, np.array([next(steps)]))[0]
+
+    with contextlib.closing(collect.play(task, draw_act, map(Given, seeds), longest)) as played:
+        while sum(len(e.rewards) for e in episodes) < at_least:
+            episodes.append(next(played))
+    return episodes
+
+
+@pytest.mark.parametrize("slots", [1, 3, 64])
+@pytest.mark.parametrize(("at_least", "longest"), [(1, None), (100, None), (130, 30), (450, None)])
+def test_as_many_episodes_as_one_after_another(monkeypatch, slots, at_least, longest):
     """Ant's end early: the next begins when those before it cannot have enough steps, and none is left unfinished."""
     task = get_task("Ant")
-    many = together.play(task, noisy(task, 3.0), itertools.count(7), at_least)
     monkeypatch.setattr(together, "SLOTS", slots)
-    few = together.play(task, noisy(task, 3.0), itertools.count(7), at_least)
-    assert len({e.terminated for e in many}) == 2 or at_least < 450, "the case must have early ends and late ones"
-    assert sum(len(e.rewards) for e in many[:-1]) < at_least <= sum(len(e.rewards) for e in many)
-    assert len(few) == len(many)
-    for a, b in zip(few, many, strict=True):
+    got = together.play(task, noisy(task, 3.0), itertools.count(7), at_least, longest)
+    plain = one_after_another(task, itertools.count(7), at_least, longest)
+    assert len({e.terminated for e in plain}) == 2 or at_least < 450, "the case must have early ends and late ones"
+    assert sum(len(e.rewards) for e in plain[:-1]) < at_least <= sum(len(e.rewards) for e in plain)
+    assert len(got) == len(plain)
+    for a, b in zip(got, plain, strict=True):
         assert all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 
 
@@ -80,18 +101,41 @@ def test_drawn_episodes_do_not_depend_on_how_many_run_at_a_time(monkeypatch):
     assert len(few.episodes) == len(many.episodes) >= 4
     for a, b in zip(many.episodes, few.episodes, strict=True):
         np.testing.assert_allclose(a.states, b.states, atol=1e-5)
-    for x, y in zip(many.actions, few.actions, strict=True):
+    for x, y, e in zip(many.actions, few.actions, many.episodes, strict=True):
         np.testing.assert_allclose(x, y, atol=1e-5)
+        np.testing.assert_allclose(np.clip(x, -1, 1), e.actions, atol=1e-6)
     assert len({e.states[0].tobytes() for e in many.episodes}) == len(many.episodes)
-    first = [np.float32(a[0]) for a in many.actions]
-    assert len({a.tobytes() for a in first}) == len(first), "every episode has noise of its own"
+    z = np.concatenate([(a - gaussian.mean(policy, e.states[:-1])) for a, e in zip(*many[::-1], strict=True)])
+    assert stats.kstest(z.ravel(), "norm").pvalue > 1e-3
+    first = {np.round(a[0], 3).tobytes() for a in many.actions}
+    assert len(first) == len(many.actions), "every episode has noise of its own"
 
 
-def test_any_other_environment_is_played_one_by_one():
-    assert not together.applies(probe.PROBE)
-    assert not together.applies(one_by_one(get_task("Swimmer")))
-    plain = on_policy.collect(one_by_one(get_task("Swimmer")), random_policy(0, 10, 2), 10, np.random.default_rng(3))
-    assert [len(e.rewards) for e in plain.episodes] == [200]
+@pytest.mark.parametrize("name", ["Swimmer", "Ant"])
+def test_returns_are_those_of_the_plain_evaluation(name):
+    task = get_task(name)
+    act = partial(gaussian.mean, random_policy(1, task.state_size, task.action_size))
+    expected = collect.evaluate(task, act, 5, seed=4)
+    np.testing.assert_array_equal(together.evaluate(task, act, 5, seed=4), expected)
+    assert len(set(expected)) == 5
+
+
+def test_any_other_environment_is_played_one_after_another():
+    act = partial(gaussian.mean, random_policy(1, 2, 2))
+    for task in (probe.PROBE, probe.ENDING_PROBE, dataclasses.replace(get_task("Swimmer"), make=probe.ProbeEnv)):
+        assert not together.applies(task)
+    for task in (probe.PROBE, probe.ENDING_PROBE):
+        np.testing.assert_array_equal(together.evaluate(task, act, 6, seed=4), collect.evaluate(task, act, 6, seed=4))
+
+
+def test_steps_are_told_and_the_evaluation_has_its_bound():
+    task, told = get_task("Swimmer"), []
+    together.play(task, noisy(task), itertools.count(), 250, 100, told.append)
+    assert told == [*range(3, 301, 3)]
+    act = partial(gaussian.mean, random_policy(1, task.state_size, task.action_size))
+    np.testing.assert_array_equal(
+        together.evaluate(task, act, 9, 4, at_most=350), collect.evaluate(task, act, 9, 4, at_most=350)
+    )
 
 
 def test_what_is_not_a_number_is_named():
@@ -102,6 +146,10 @@ def test_what_is_not_a_number_is_named():
 
     with pytest.raises(DivergedError, match="Swimmer: step 3 of an episode: expected numbers as action"):
         together.play(task, act, iter(range(3)))
+    with pytest.raises(
+        TaskError, match=r"Swimmer: step 0 of an episode: expected an action of 2 numbers, got shape \[3"
+    ):
+        together.play(task, lambda states, numbers, steps: np.zeros((len(states), 3)), iter([0]))
 
 
 def test_a_simulation_that_diverges_is_named(monkeypatch):
@@ -115,5 +163,5 @@ def test_a_simulation_that_diverges_is_named(monkeypatch):
 
     monkeypatch.setattr(mujoco.MujocoTask, "advance", diverged)
     act = lambda states, numbers, steps: np.where(steps[:, None] == 2, 1.0, 0.0) * np.ones((len(states), 2))  # noqa: E731
-    with pytest.raises(TaskError, match=r"Swimmer: the simulation diverged \(at step 2 of an episode\)"):
+    with pytest.raises(EpisodeError, match=r"Swimmer: the simulation diverged \(at step 2 of an episode\)"):
         together.play(get_task("Swimmer"), act, iter([0]))

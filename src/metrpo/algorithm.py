@@ -46,7 +46,7 @@ from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.types import Array, Episode
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
-from metrpo.world import logged
+from metrpo.world import logged, together
 from metrpo.world.dataset import Dataset
 from metrpo.world.origin import relative, shifted
 from metrpo.world.registry import get_task, without_formulas
@@ -443,7 +443,7 @@ def evaluate(
     seed = int(rng_of(config.seed, iteration, stage).integers(2**31))
     act: real.Act = partial(gaussian.mean, _host(policy))
     act = act if origin is None else _of_real(act, origin)
-    return real.evaluate(task, act, config.evaluation_episodes, seed, EVALUATION_STEPS)
+    return together.evaluate(task, act, config.evaluation_episodes, seed, EVALUATION_STEPS)
 
 
 def _of_real(act: real.Act, origin: np.ndarray) -> real.Act:

@@ -13,6 +13,7 @@ from metrpo.policy.gaussian import Policy
 from metrpo.types import Episode
 from metrpo.world import collect as real
 from metrpo.world import together
+from metrpo.world.collect import seed_of
 from metrpo.world.task import Task
 
 
@@ -34,10 +35,10 @@ def collect(
 ) -> Drawn:
     """Whole episodes of `at_least` steps together, acting by samples of `policy` (see `world.collect.collect`).
 
-    Those of the paper's tasks are played many at a time (`world.together`).
+    The paper's tasks are played many episodes at a time (`world.together`), each with noise of its own.
     """
-    if together.applies(task) and (longest is None or longest >= task.horizon):
-        return _together(task, policy, at_least, rng, on_episode)
+    if together.applies(task):
+        return _together(task, policy, at_least, rng, on_episode, longest)
     host = jax.tree.map(np.asarray, policy)
     std, drawn, actions = np.exp(host.log_std), list[list[np.ndarray]](), list[np.ndarray]()
 
@@ -60,17 +61,21 @@ def collect(
 
 
 def _together(
-    task: Task, policy: Policy, at_least: int, rng: np.random.Generator, on_steps: Callable[[int], None]
+    task: Task,
+    policy: Policy,
+    at_least: int,
+    rng: np.random.Generator,
+    on_steps: Callable[[int], None],
+    longest: int | None,
 ) -> Drawn:
-    """Each episode has a seed and noise of its own, so that it is the same one however many are played at a time."""
     host = jax.tree.map(np.asarray, policy)
     std, noise, drawn = np.exp(host.log_std), list[np.ndarray](), list[np.ndarray]()
 
     def seeds() -> Iterator[int]:
         while True:
-            noise.append(std * np.random.default_rng(real.seed_of(rng)).standard_normal((task.horizon, len(std))))
+            noise.append(std * np.random.default_rng(seed_of(rng)).standard_normal((task.horizon, len(std))))
             drawn.append(np.empty((task.horizon, len(std)), np.float32))
-            yield real.seed_of(rng)
+            yield seed_of(rng)
 
     def act(states: np.ndarray, numbers: np.ndarray, steps: np.ndarray) -> np.ndarray:
         actions = gaussian.mean(host, states)
@@ -79,5 +84,5 @@ def _together(
             drawn[number][step] = actions[i]
         return actions
 
-    episodes = together.play(task, act, seeds(), at_least, on_steps)
+    episodes = together.play(task, act, seeds(), at_least, longest, on_steps)
     return Drawn(episodes, [actions[: len(e.rewards)] for actions, e in zip(drawn, episodes, strict=True)])

@@ -1,7 +1,8 @@
-"""Many real episodes of the paper's tasks at a time: one call of the policy for all, and threads for the physics.
+"""Many real episodes at a time: one call of the policy for all of them, and threads for the physics.
 
-They are the episodes that one after another gives: each has its own seed, the physics of each its own memory (the
-solver's warm start included), and which episodes are played does not depend on how many run at a time.
+For the paper's tasks; others are played one after another (`metrpo.world.collect`). The episodes are the same: each has
+its own seed, the physics of each its own memory (the solver's warm start included), and which episodes are played does
+not depend on how many run at a time.
 
 `mujoco.rollout` would not do with a policy in the loop: it hands out neither the solver's warm start, without which the
 next call computes other contacts, nor the centre of mass after a step, but before it.
@@ -16,12 +17,11 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from typing import NamedTuple
 
-import gymnasium
 import numpy as np
 
-from metrpo.errors import DivergedError, TaskError
+from metrpo.errors import EpisodeError
 from metrpo.types import Episode
-from metrpo.world import mujoco
+from metrpo.world import collect, mujoco
 from metrpo.world.task import Task
 
 ActAll = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -40,30 +40,30 @@ class Stepped(NamedTuple):
     """[n]"""
     terminated: np.ndarray
     """[n] of bool"""
-    truncated: np.ndarray
-    """[n] of bool"""
 
 
 class SideBySide:
     """Simulations of one of the paper's tasks that share its model; equal to its environment step by step."""
 
-    def __init__(self, task: Task, count: int, threads: int) -> None:
+    def __init__(self, task: Task, threads: int) -> None:
         self._envs = [mujoco.MujocoTask(task.name)]
-        self._task, self._limit = self._envs[0].task, time_limit(task)
-        self._states = np.zeros((count, task.state_size))
+        self._task = self._envs[0].task
+        self._states = np.zeros((SLOTS, task.state_size))
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self._threads = threads
-        self.count = count
 
     def reset(self, slot: int, seed: int) -> np.ndarray:
-        """A fresh episode in `slot`: its start state [S]."""
+        """A fresh episode there: its start state [S]."""
         while slot >= len(self._envs):
             self._envs.append(mujoco.MujocoTask(self._task.name, model=self._envs[0].model))
         self._states[slot] = self._envs[slot].reset(seed=seed)[0]
         return self._states[slot].copy()
 
     def step(self, slots: Sequence[int], actions: np.ndarray, steps: np.ndarray) -> Stepped:
-        """One step of the episodes in `slots`, with actions [n, A] in [-1, 1]; `steps` [n] are behind them."""
+        """One step of the episodes in `slots`, with actions [n, A] in [-1, 1]; `steps` [n] are behind them.
+
+        Raises `EpisodeError` when a simulation diverges.
+        """
         rows, actions = np.asarray(slots), actions.astype(np.float64)
         before, controls = self._states[rows], self._envs[0].controls(actions)
 
@@ -77,11 +77,10 @@ class SideBySide:
         after = self._states[rows]
         if not np.isfinite(after).all():
             step = int(steps[np.flatnonzero(~np.isfinite(after).all(axis=1))[0]])
-            raise TaskError(f"{self._task.name}: the simulation diverged (at step {step} of an episode)")
+            raise EpisodeError(f"{self._task.name}: the simulation diverged (at step {step} of an episode)")
         assert self._task.reward is not None
         rewards, ends = self._task.reward(before, actions, after), self._task.terminated
-        terminated = ends(after) if callable(ends) else np.zeros(len(rows), bool)
-        return Stepped(after, rewards, terminated, steps + 1 >= self._limit)
+        return Stepped(after, rewards, ends(after) if callable(ends) else np.zeros(len(rows), bool))
 
     def close(self) -> None:
         """Ends the threads."""
@@ -90,14 +89,8 @@ class SideBySide:
 
 
 def applies(task: Task) -> bool:
-    """Whether the task is one of the paper's, which alone can be played so."""
+    """Whether a task's episodes can be played side by side: the paper's, in the environment that metrpo gives them."""
     return task.make is None and task.env_id == f"metrpo/{task.name}-v0" and mujoco.is_robot(task.name)
-
-
-def time_limit(task: Task) -> int:
-    """Steps after which the task's environment cuts an episode off."""
-    assert task.env_id is not None
-    return gymnasium.spec(task.env_id).max_episode_steps or task.horizon
 
 
 class _Running:
@@ -118,29 +111,32 @@ def play(
     act: ActAll,
     seeds: Iterator[int],
     at_least: float = math.inf,
+    longest: int | None = None,
     on_steps: Callable[[int], None] = lambda steps: None,
     threads: int | None = None,
 ) -> list[Episode]:
     """Whole episodes from resets by `seeds`, until they have `at_least` steps together or the seeds are used up.
 
     The very episodes that playing one after another would give, in the order of their seeds: another one begins only
-    when those before it cannot have enough steps. `on_steps(steps so far)` follows every step.
+    when those before it cannot have enough steps. An episode of more than `longest` steps is cut there. `on_steps(steps
+    so far)` follows every step; `threads` (by default as many as cores) share the physics.
 
-    Raises `TaskError` where the environment gives NaN or infinity, `DivergedError` where the policy gives NaN.
+    Raises `EpisodeError` where a simulation diverges, `TaskError` where the policy is another task's, `DivergedError`
+    where it gives NaN.
     """
-    horizon = task.horizon
+    horizon = task.horizon if longest is None else min(longest, task.horizon)
     ended: dict[int, Episode] = {}
-    with closing(SideBySide(task, SLOTS, threads or _cores())) as slots:
-        running: dict[int, _Running] = {}
-        free = list(range(slots.count))[::-1]
-        steps = begun = 0
+    running: dict[int, _Running] = {}
+    free = list(range(SLOTS))[::-1]
+    steps = begun = 0
+    with closing(SideBySide(task, threads or _cores())) as slots:
         while True:
             while free and steps + _left(running, horizon) < at_least and (seed := next(seeds, None)) is not None:
                 slot = free.pop()
                 running[slot], begun = _Running(begun, slots.reset(slot, seed)), begun + 1
             if not running:
                 return [ended[number] for number in range(begun)]
-            for slot, terminated in _advance(task.name, slots, running, act):
+            for slot, terminated in _advance(task, slots, running, act, horizon):
                 episode = running.pop(slot)
                 ended[episode.number] = episode.finished(terminated)
                 free.append(slot)
@@ -153,26 +149,34 @@ def _left(running: dict[int, _Running], horizon: int) -> int:
     return sum(horizon - len(r.rewards) for r in running.values())
 
 
-def _advance(name: str, slots: SideBySide, running: dict[int, _Running], act: ActAll) -> list[tuple[int, bool]]:
+def _advance(
+    task: Task, slots: SideBySide, running: dict[int, _Running], act: ActAll, horizon: int
+) -> list[tuple[int, bool]]:
     """One step of every episode under way; those that ended by it, and whether the task ended them."""
     order, now = list(running), list(running.values())
     steps = np.array([len(r.rewards) for r in now])
-    states = np.array([r.states[-1] for r in now])
-    drawn = act(states, np.array([r.number for r in now]), steps)
-    if np.isnan(drawn).any():
-        first = int(np.flatnonzero(np.isnan(drawn).any(axis=1))[0])
-        raise DivergedError(
-            f"{name}: step {steps[first]} of an episode: expected numbers as action, got {drawn[first].tolist()}; "
-            "the policy has diverged: go back to one from before, or start anew"
-        )
-    actions = np.clip(drawn, -1.0, 1.0).astype(np.float32)
+    actions = act(np.array([r.states[-1] for r in now]), np.array([r.number for r in now]), steps)
+    if actions.shape != (len(now), task.action_size) or np.isnan(actions).any():
+        for action, step in zip(actions, steps, strict=True):
+            collect.action_of(task, action, f"step {step} of an episode")  # raises
+    actions = np.clip(actions, -1.0, 1.0).astype(np.float32)
     got = slots.step(order, actions, steps)
     for i, r in enumerate(now):
         r.states.append(got.states[i])
         r.actions.append(actions[i])
         r.rewards.append(float(got.rewards[i]))
-    over = got.terminated | got.truncated
+    over = got.terminated | (steps + 1 >= horizon)
     return [(slot, bool(got.terminated[i])) for i, slot in enumerate(order) if over[i]]
+
+
+def evaluate(task: Task, act: collect.Act, episodes: int, seed: int, at_most: int | None = None) -> np.ndarray:
+    """`collect.evaluate` for an `act` that takes many states at once, [n, S] -> [n, A]: the same returns, sooner."""
+    if not applies(task):
+        return collect.evaluate(task, act, episodes, seed, at_most)
+    rng = np.random.default_rng(seed)
+    seeds = (collect.seed_of(rng) for _ in range(episodes))
+    played = play(task, lambda states, numbers, steps: act(states), seeds, at_most or math.inf)
+    return np.array([e.rewards.sum(dtype=np.float64) for e in played])
 
 
 def _cores() -> int:
