@@ -277,6 +277,14 @@ def test_a_run_that_died_before_its_first_episode_claims_nothing(tmp_path):
         train(tmp_path, CONFIG)
 
 
+def test_what_may_be_deleted_is_quoted_for_a_shell(tmp_path):
+    """Pasted behind rm, a path with a space would name two others."""
+    spaced = tmp_path / "a dir" / "run"
+    train(spaced)
+    with pytest.raises(RunDirectoryError, match=rf"delete '{spaced}' first"):
+        train(spaced, dataclasses.replace(CONFIG, seed=CONFIG.seed + 1))
+
+
 @pytest.mark.parametrize("kept", ["episodes/run-000000.npz", "checkpoints/iteration-00001.npz.damaged", "metrics.csv"])
 def test_a_run_with_anything_to_lose_keeps_its_claim(tmp_path, kept):
     with RunDirectory(tmp_path, CONFIG) as run:

@@ -7,6 +7,7 @@ import fcntl
 import json
 import os
 import platform
+import shlex
 import time
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -148,5 +149,5 @@ def require_same(stored: Config, asked: Config, where: Path | str, folder: Path)
         )
         raise RunDirectoryError(
             f"{where} holds a run with other settings:\n{table}\nask for the same settings, choose another directory "
-            f"(--run-dir DIR), or begin anew: delete {folder} first"
+            f"(--run-dir DIR), or begin anew: delete {shlex.quote(str(folder))} first"
         )
