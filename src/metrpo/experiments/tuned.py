@@ -26,7 +26,7 @@ _WIDE = 160
 """Columns of the table where no terminal says how many there are."""
 _SHOWN = 10
 """Trials in the table."""
-_ENOUGH = 10
+ENOUGH = 10
 """Complete trials, below which nothing is said of a setting's importance: it would be that of chance."""
 
 
@@ -152,7 +152,7 @@ def _importance(study: Study, search: Search) -> dict[str, float]:
     import optuna
 
     values = [t.value for t in study.get_trials(deepcopy=False, states=[optuna.trial.TrialState.COMPLETE])]
-    if len(values) < _ENOUGH or len(set(values)) == 1 or len(search.space) < 2:
+    if len(values) < ENOUGH or len(set(values)) == 1 or len(search.space) < 2:
         return {}
     return {name: float(share) for name, share in optuna.importance.get_param_importances(study).items()}
 
