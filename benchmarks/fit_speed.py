@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import time
 from pathlib import Path
 
@@ -46,7 +47,7 @@ def main() -> None:
         return jax.device_put(datasets.with_capacity(cut, capacity))
 
     for variant in arguments.variants:
-        values = {} if variant == "as-run" else dict(pair.split("=") for pair in variant.split(","))
+        values = {} if variant == "as-run" else dict(pair.split("=") for pair in re.split(r",(?=[a-z])", variant))
         now = override(settings, {name: json.loads(value) for name, value in values.items()})
         e, losses, seconds = now.ensemble, [], []
         networks = ensembles.init(jax.random.key(7), e.members, task.state_size, task.action_size, e.hidden)
