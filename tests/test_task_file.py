@@ -72,8 +72,11 @@ def test_a_module_of_the_current_folder_is_found(tmp_path, monkeypatch):
     write("my_task.py", MAKE, horizon=30)
     assert get_task("my_task:make").horizon == 30
     write("there/other_task.py", MAKE, horizon=40)
-    with pytest.raises(TaskError, match=r"cannot import other_task \(ModuleNotFoundError"):
+    with pytest.raises(TaskError, match="expected a module other_task in .*, found none; go to the folder that holds"):
         get_task("other_task:make")
+    write("needy_task.py", "import other_task")
+    with pytest.raises(TaskError, match=r"cannot import needy_task \(ModuleNotFoundError: No module named 'other_task'"):
+        get_task("needy_task:make")
 
 
 def test_gymnasiums_own_form_imports_what_registers_the_id():
@@ -139,6 +142,39 @@ def test_a_run_is_evaluated_from_another_folder_and_after_its_file_moved(tmp_pat
     assert evaluated(capsys, "run", "--task", "moved/mine.py:make") == (0, "moved/mine.py:make")
 
 
+def forgotten(monkeypatch, *names):
+    """As in a new process."""
+    monkeypatch.setattr(resolve, "_PLACES", {})
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if "/pytest-" not in place])
+    resolve._resolve.cache_clear()
+    for name in names:
+        del sys.modules[name]
+
+
+def test_a_run_of_a_module_is_evaluated_from_another_folder_and_after_it_moved(tmp_path, monkeypatch, capsys):
+    Path("there/parts").mkdir()
+    write("there/parts/__init__.py", "LENGTH = 5\n")
+    write("there/parts/mine.py", "from . import LENGTH\n" + textwrap.dedent(MAKE).format(horizon="LENGTH"))
+    monkeypatch.chdir("there")
+    get_task("parts.mine:make")
+    a_run(tmp_path / "run", "parts.mine:make")
+    assert json.loads((tmp_path / "run" / "run.json").read_text())["task_folder"] == str(tmp_path / "there")
+    monkeypatch.chdir(tmp_path)
+    forgotten(monkeypatch, "parts.mine", "parts")
+    assert evaluated(capsys, "run") == (0, "parts.mine:make")
+    (tmp_path / "there").rename(tmp_path / "moved")
+    forgotten(monkeypatch, "parts.mine", "parts")
+    code, said = evaluated(capsys, "run")
+    assert code == 2
+    assert "expected a module parts.mine in " in said
+    assert "if it has moved, say where: --task path/to/file.py:name" in said
+
+
+def test_the_folder_of_an_installed_module_is_not_kept(monkeypatch):
+    assert resolve.folder_of("pytest:fixture") is None
+    assert resolve.folder_of("Pendulum-v1") is resolve.folder_of("mine.py:make") is None
+
+
 def test_a_policy_may_be_evaluated_on_another_task_of_its_sizes(tmp_path, capsys):
     save_policy(tmp_path / "run", random_policy(0, 11, 3), "Hopper", 1, 200, 1.5)
     assert evaluated(capsys, "run", "--task", "HopperUpright") == (0, "HopperUpright")
@@ -179,6 +215,27 @@ def test_every_command_that_plays_or_learns_takes_the_place_anew(command, monkey
     assert cli.main([command, "run", "--task", "there/moved.py:make"]) == 2
     assert "far enough" in capsys.readouterr().err
     assert [name.startswith("metrpo_task_moved") for name in made] == [True]
+
+
+@pytest.mark.parametrize("command", ["collect", "improve", "evaluate", "render"])
+def test_the_error_names_the_task_that_was_tried(command, capsys):
+    write("mine.py", MAKE, horizon=5)
+    a_run(Path("run"), "mine.py:make")
+    Path("run/config.json").write_text(to_json(preset("mine.py:make")))
+    assert cli.main([command, "run", "--task", "nofile.py:task"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("metrpo: nofile.py:task: expected a Python file at ")
+    assert "--task" not in said, "that is where it was tried"
+    assert cli.main([command, "run", "--task", "Swimer"]) == 2
+    assert "unknown task 'Swimer'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["train", "init"])
+def test_a_new_run_is_not_told_of_an_option_that_its_command_lacks(command, capsys):
+    assert cli.main([command, "nofile.py:task"]) == 2
+    said = capsys.readouterr().err
+    assert "nofile.py:task: expected a Python file at " in said
+    assert "--task" not in said
 
 
 def raising():

@@ -13,6 +13,10 @@ class TaskError(MetrpoError):
     """A task is unknown, or its environment broke its promise."""
 
 
+class MissingTaskError(TaskError):
+    """The file or module that a task's name says is not there."""
+
+
 class EpisodeError(TaskError):
     """An environment has failed in an episode, which may go better the next time."""
 

@@ -1,37 +1,47 @@
-"""Where the file of a run's task lies: the name in its settings, file.py:name, means it from one directory only."""
+"""Where a run's task lies: the name in its settings, file.py:name or module:name, means it from one directory only."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
 
-from metrpo.errors import ConfigError, RunDirectoryError
+from metrpo.errors import ConfigError, MissingTaskError, RunDirectoryError
 from metrpo.run.files import atomic_write
 from metrpo.untrusted import json_of, text_of
 from metrpo.world import resolve
 from metrpo.world.registry import get_task
 from metrpo.world.task import Task
 
-_FIELD = "task_file"
+_FILE, _FOLDER = "task_file", "task_folder"
 
 
 def remember(run_dir: str | Path, task: str) -> None:
-    """Notes in `run.json` where the file of the task `task` lies now, if it is named by one."""
-    file = resolve.file_of(task)
+    """Notes in `run.json` where the file of the task `task` lies now, or its module's folder, if it is named by one."""
     about = _about(run_dir)
-    if file is not None and about.get(_FIELD) != str(file):
-        atomic_write(Path(run_dir) / "run.json", json.dumps(about | {_FIELD: str(file)}, indent=2) + "\n")
+    places = {_FILE: resolve.file_of(task), _FOLDER: resolve.folder_of(task)}
+    noted = {field: str(place) for field, place in places.items() if place is not None}
+    if about | noted != about:
+        atomic_write(Path(run_dir) / "run.json", json.dumps(about | noted, indent=2) + "\n")
 
 
 def task_of_run(run_dir: str | Path, task: str) -> Task:
-    """The task of that name as the run has it: from its file where that lay, if it is still there, or as the name says.
+    """The task of that name as the run has it: from where its file or module lay, if it is still there, or as the name
+    says.
 
     From then on the name means that task in this process. Raises `TaskError` when there is none.
     """
-    lay, file = _about(run_dir).get(_FIELD), resolve.file_of(task)
+    about, file = _about(run_dir), resolve.file_of(task)
+    lay, folder = about.get(_FILE), about.get(_FOLDER)
     if file is not None and isinstance(lay, str) and Path(lay).name == file.name and Path(lay).is_file():
-        resolve.place(task, f"{lay}:{task.rpartition(':')[2]}")
-    return get_task(task)
+        return resolve.place(task, get_task(f"{lay}:{task.rpartition(':')[2]}"))
+    if isinstance(folder, str) and resolve.is_in(Path(folder), task):
+        found = resolve.resolve(task, Path(folder))
+        assert found is not None, "it has a colon"
+        return resolve.place(task, found)
+    try:
+        return get_task(task)
+    except MissingTaskError as error:
+        raise MissingTaskError(f"{error}; if it has moved, say where: --task path/to/file.py:name") from error
 
 
 def moved(task: str, where: str) -> Task:
@@ -41,8 +51,7 @@ def moved(task: str, where: str) -> Task:
     """
     if ":" not in task:
         raise ConfigError(f"task: expected it for a run whose task lies in a file or module, got {where} for {task}")
-    resolve.place(task, where)
-    return get_task(task)
+    return resolve.place(task, get_task(where))
 
 
 def _about(run_dir: str | Path) -> dict[str, object]:

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import gymnasium
 
-from metrpo.errors import TaskError
+from metrpo.errors import MissingTaskError, TaskError
 from metrpo.types import Array
 from metrpo.world import interface, returned
 from metrpo.world.guard import Guarded
@@ -74,13 +74,14 @@ def _make(env: str | MakeEnv, name: str, horizon: int | None, **kwargs: Any) -> 
     return Guarded(made, name, horizon)
 
 
-_PLACES: dict[str, str] = {}
+_PLACES: dict[str, Task] = {}
 """What a name stands for in this process, where that is not what it says."""
 
 
-def place(name: str, where: str) -> None:
-    """From here on `name` stands for the task `where`: its file lies elsewhere than when a run was named by it."""
-    _PLACES[name] = where
+def place(name: str, task: Task) -> Task:
+    """From here on `name` stands for `task`, which is returned under that name."""
+    _PLACES[name] = dataclasses.replace(task, name=name)
+    return _PLACES[name]
 
 
 def file_of(name: str) -> Path | None:
@@ -89,19 +90,48 @@ def file_of(name: str) -> Path | None:
     return Path(module).resolve() if colon and module.endswith(".py") else None
 
 
-def resolve(name: str) -> Task | None:
+def module_of(name: str) -> str | None:
+    """The module of the task module:name; None for any other name."""
+    module, colon, _ = name.rpartition(":")
+    return module if colon and not module.endswith(".py") and "/" not in module else None
+
+
+def folder_of(name: str) -> Path | None:
+    """The folder, absolute, in which Python has found the module of the task module:name.
+
+    None for any other name, and for what is installed, which every folder finds.
+    """
+    module = module_of(name)
+    file = getattr(sys.modules.get(module or ""), "__file__", None)
+    if module is None or not isinstance(file, str):
+        return None
+    found = Path(file).resolve().parents[module.count(".") + (Path(file).stem == "__init__")]
+    return None if {"site-packages", "dist-packages"} & set(found.parts) else found
+
+
+def is_in(folder: Path, name: str) -> bool:
+    """Whether the module of the task module:name lies in `folder`."""
+    path = folder.joinpath(*(module_of(name) or "").split("."))
+    return module_of(name) is not None and (path.with_suffix(".py").is_file() or (path / "__init__.py").is_file())
+
+
+def resolve(name: str, folder: Path | None = None) -> Task | None:
     """The task that `name` stands for: an id, or `module:name` or `file.py:name` of a task, of what makes an
     environment, or of an id that the module registers.
 
-    None when it is neither; the same object every time. Raises `TaskError` when it is one and cannot be used.
+    `folder` (default: the current one) is searched for modules first. None when it is neither; the same object every
+    time. Raises `TaskError` when it is one and cannot be used, `MissingTaskError` when there is no such file or module.
     """
-    where = _PLACES.get(name, name)
-    file = file_of(where)
-    return _resolve(name, where if file is None else f"{file}:{where.rpartition(':')[2]}")
+    if name in _PLACES:
+        return _PLACES[name]
+    if module_of(name) is not None:
+        return _resolve(name, name, folder or Path.cwd())
+    file = file_of(name)
+    return _resolve(name, name if file is None else f"{file}:{name.rpartition(':')[2]}")
 
 
 @cache
-def _resolve(name: str, where: str) -> Task | None:
+def _resolve(name: str, where: str, folder: Path | None = None) -> Task | None:
     if where.startswith("dm_control/"):
         _register_dm_control()
         if where in gymnasium.registry:
@@ -111,7 +141,7 @@ def _resolve(name: str, where: str) -> Task | None:
     module, colon, attribute = where.rpartition(":")
     if not colon:
         return None
-    value = getattr(_import(module, name), attribute, None)
+    value = getattr(_import(module, name, folder), attribute, None)
     if value is None and attribute in gymnasium.registry:
         return task_of(attribute, name=name)
     if value is None:
@@ -123,16 +153,22 @@ def _resolve(name: str, where: str) -> Task | None:
     raise TaskError(f"{name}: expected a metrpo.Task or a function that makes an environment, got {value!r}")
 
 
-def _import(module: str, name: str) -> Any:
+def _import(module: str, name: str, folder: Path | None) -> Any:
     path = Path(module) if module.endswith(".py") else None
     if path is not None and not path.is_file():
-        advice = "if it has moved, say where: --task path/to/file.py:name"
-        raise TaskError(f"{name}: expected a Python file at {path}, found none; {advice}")
+        raise MissingTaskError(f"{name}: expected a Python file at {path}, found none")
     try:
-        with _on_path(Path.cwd() if path is None else path.parent):
+        with _on_path(path.parent if path is not None else folder or Path.cwd()):
             return importlib.import_module(module) if path is None else _load(path)
     except TaskError:
         raise
+    except ModuleNotFoundError as error:
+        if path is not None or not f"{module}.".startswith(f"{error.name}."):  # what it imports is missing
+            raise TaskError(f"{name}: cannot import {module} ({type(error).__name__}: {error})") from error
+        raise MissingTaskError(
+            f"{name}: expected a module {module} in {folder} or on Python's path, found none; go to the folder that "
+            "holds it, or add that folder to PYTHONPATH"
+        ) from error
     except Exception as error:
         raise TaskError(f"{name}: cannot import {module} ({type(error).__name__}: {error})") from error
 
