@@ -168,6 +168,7 @@ class Shifting(Env):
         return np.zeros(3 + (self.t > 1), np.float32)
 
 
+BOX = Box(-1, 1, (3,))
 BROKEN = {
     "a NaN observation": (
         broken(observation=lambda self: np.array([0, np.nan, 0] if self.t else [0, 0, 0], np.float32)),
@@ -199,6 +200,32 @@ BROKEN = {
     "a discrete observation": (
         broken(observation_space=Discrete(3)),
         "Mine: observation_space: expected a Box, or a Dict or Tuple of them, got Discrete",
+    ),
+    "a part of an observation that is no number": (
+        broken(observation_space=Dict({"deep": Dict({"mode": Discrete(3)}), **{f"joint{i}": BOX for i in range(9)}})),
+        r"expected a Box, or a Dict or Tuple of them, got Discrete\(3\) at \['deep'\]\['mode'\]; encode",
+    ),
+    "many actions": (
+        broken(action_space=Dict({f"joint{i}": BOX for i in range(9)})),
+        "action_space: expected a Box of floats, got a Dict of 'joint0', .* 'joint8'; metrpo learns",
+    ),
+    "an observation that lacks a part": (
+        broken(observation_space=Dict(a=BOX, b=BOX), observation=lambda self: {"a": np.zeros(3)}),
+        r"reset\(\): expected an observation of Box\(.*\) at \['b'\], got \{'a'.*KeyError",
+    ),
+    "a part that is not finite": (
+        broken(
+            observation_space=Dict(a=BOX, b=BOX), observation=lambda self: {"a": np.zeros(3), "b": np.full(3, np.nan)}
+        ),
+        r"expected finite numbers, got nan at index 3 \(\['b'\]\)",
+    ),
+    "a picture among the parts": (
+        broken(observation_space=Dict(a=BOX, picture=Box(0, 255, (96, 96)))),
+        r"expected observations of at most 4,000 numbers, got 9,219, 9,216 of them at \['picture'\]: a full dataset",
+    ),
+    "a function without a return": (
+        lambda **kw: None,
+        r"Mine: expected a gymnasium.Env, got None: does the function lack a return\?",
     ),
     "the old interface of step": (
         broken(step=lambda self, a: (np.zeros(3, np.float32), 0.0, False, {})),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from metrpo.errors import NotFiniteError, TaskError
 from metrpo.world import returned
 from metrpo.world.limits import require_size
-from metrpo.world.returned import broken, representable
+from metrpo.world.returned import broken, representable, shown
 
 _HUGE = 1e9
 """A bound as large as this says that there is none: an action in [-1, 1] would stand for numbers that nobody wants."""
@@ -34,7 +35,7 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         space: Any = getattr(env, "observation_space", None)
         if not (isinstance(actions, Box) and np.issubdtype(actions.dtype, np.floating)):
             advice = "metrpo learns continuous control; discretised actions can be made continuous by a wrapper"
-            raise broken(name, "action_space", "a Box of floats", actions, advice)
+            raise broken(name, "action_space", "a Box of floats", shown(actions), advice)
         if not (np.abs(actions.low) < _HUGE).all() or not (np.abs(actions.high) < _HUGE).all():
             raise broken(
                 name,
@@ -44,13 +45,16 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
                 "give the Box the range that the motors have, or wrap the environment: gymnasium.wrappers."
                 "TransformAction(env, lambda action: action, gymnasium.spaces.Box(low, high, shape))",
             )
-        if not _is_numeric(space):
+        if refused := [f"{shown(part)}{_at(path)}" for path, part in parts(space) if not isinstance(part, Box)]:
             advice = "encode it as numbers, for example with a gymnasium.ObservationWrapper"
-            raise broken(name, "observation_space", "a Box, or a Dict or Tuple of them", space, advice)
+            expected = "a Box, or a Dict or Tuple of them"
+            raise broken(name, "observation_space", expected, _several(refused), advice)
         self._actions, self._observations = actions, space
         self._low, self._high = actions.low.astype(np.float64), actions.high.astype(np.float64)
         self._size = int(gymnasium.spaces.flatdim(space))
-        require_size(name, self._size)
+        sizes = {path: int(np.prod(part.shape)) for path, part in parts(space)}
+        most = max(sizes, key=lambda path: sizes[path], default=())
+        require_size(name, self._size, f"{sizes[most]:,} of them{_at(most)}" if most else "")
         self.action_size = int(np.prod(actions.shape))
         self.observation_space = Box(-np.inf, np.inf, (self._size,), np.float64)
         self.action_space = Box(-1.0, 1.0, (self.action_size,), np.float32)
@@ -117,8 +121,10 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         try:
             state = np.asarray(gymnasium.spaces.flatten(space, observation), np.float64).ravel()
         except Exception as error:
+            path, part, value = _misfit(space, observation)
             advice = f"return observations of the space ({type(error).__name__}: {error})"
-            raise broken(self._name, call, f"an observation of {space}", observation, advice) from error
+            expected = f"an observation of {shown(part)}{_at(path)}"
+            raise broken(self._name, call, expected, value, advice) from error
         if (isinstance(space, Box) and np.shape(observation) != space.shape) or state.size != self._size:
             got = f"shape {list(np.shape(observation))}"
             advice = "shapes may not change within a run"
@@ -126,7 +132,7 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         if not representable(state):
             where = next(i for i, number in enumerate(state) if not representable(number))
             advice = "end the episode before the simulation diverges, or repair the sensor"
-            got = f"{state[where]} at index {where}"
+            got = f"{state[where]} at index {where}{_part_at(space, where)}"
             raise broken(self._name, call, "finite numbers", got, advice, NotFiniteError)
         return state
 
@@ -159,9 +165,45 @@ _INNER = ("env", "_env", "venv", "gym_env")
 """Where wrappers keep what they wrap."""
 
 
-def _is_numeric(space: Any) -> bool:
-    if isinstance(space, gymnasium.spaces.Dict):
-        return all(_is_numeric(inner) for inner in space.spaces.values())
-    if isinstance(space, gymnasium.spaces.Tuple):
-        return all(_is_numeric(inner) for inner in space.spaces)
-    return isinstance(space, Box)
+Path = tuple[Any, ...]
+"""The keys and indices that lead to a part of a space."""
+
+
+def parts(space: Any, path: Path = ()) -> Iterator[tuple[Path, Any]]:
+    """The parts of Dicts and Tuples, in the order in which they are flattened, with the way to each; else the space."""
+    inner = getattr(space, "spaces", None)
+    if not isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple):
+        yield path, space
+        return
+    for key, part in inner.items() if isinstance(inner, dict) else enumerate(inner):
+        yield from parts(part, (*path, key))
+
+
+def _several(texts: list[str]) -> str:
+    return " and ".join([*texts[:3], *([f"{len(texts) - 3} more"] if len(texts) > 3 else [])])
+
+
+def _at(path: Path) -> str:
+    return " at " + "".join(f"[{key!r}]" for key in path) if path else ""
+
+
+def _part_at(space: Any, index: int) -> str:
+    """The part that holds number `index` of a flattened observation, in words."""
+    for path, part in parts(space):
+        index -= int(np.prod(part.shape))
+        if index < 0:
+            return f" ({_at(path).removeprefix(' at ')})" if path else ""
+    return ""
+
+
+def _misfit(space: Any, observation: Any) -> tuple[Path, Any, Any]:
+    """The first part of a space that an observation does not fit: the way to it, the part, and what stands there."""
+    for path, part in parts(space):
+        value = observation
+        try:
+            for key in path:
+                value = value[key]
+            gymnasium.spaces.flatten(part, value)
+        except Exception:
+            return path, part, value
+    return (), space, observation

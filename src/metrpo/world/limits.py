@@ -11,12 +11,15 @@ LONGEST = 100_000
 """Steps of an episode: every policy update imagines, and every evaluation plays, whole ones."""
 
 
-def require_size(name: str, size: int) -> None:
-    """Raises `TaskError` for observations of more than `MOST_NUMBERS` numbers, with the room that they would take."""
+def require_size(name: str, size: int, most: str = "") -> None:
+    """Raises `TaskError` for observations of more than `MOST_NUMBERS` numbers, with the room that they would take.
+
+    `most` says where most of them stand.
+    """
     if size > MOST_NUMBERS:
         kept = CollectConfig.max_train + CollectConfig.max_validation
         raise TaskError(
-            f"{name}: expected observations of at most {MOST_NUMBERS:,} numbers, got {size:,}: a full dataset of "
+            f"{name}: expected observations of at most {MOST_NUMBERS:,} numbers, got {size:,}{most and f', {most}'}: a full dataset of "
             f"{kept:,} transitions would take {kept * size * 8 / 2**30:,.0f} GiB; pictures cannot be learned here: "
             "give positions and velocities instead, or features that a network of yours makes of the picture (a "
             "gymnasium.ObservationWrapper)"

@@ -69,6 +69,8 @@ def _make(env: str | MakeEnv, name: str, horizon: int | None, **kwargs: Any) -> 
         made = gymnasium.make(env, disable_env_checker=True, **kwargs) if isinstance(env, str) else env(**kwargs)
     except Exception as error:
         raise TaskError(f"{name}: cannot be made ({type(error).__name__}: {error})") from error
+    if made is None:
+        raise TaskError(f"{name}: expected a gymnasium.Env, got None: does the function lack a return?")
     if not isinstance(made, gymnasium.Env):
         raise TaskError(f"{name}: expected a gymnasium.Env, got {type(made).__name__}; return an instance, not a class")
     return Guarded(made, name, horizon)

@@ -19,6 +19,10 @@ _MOST = float(np.finfo(np.float32).max) / 2
 """Beyond this the difference of two numbers may be infinite in float32, in which everything is learned."""
 
 
+_LONGEST = 100
+"""Characters of what an environment has given, in a message."""
+
+
 def representable(values: Any) -> bool:
     """Whether all are finite, and stay so in float32 when one is taken from another."""
     return bool(np.all(np.abs(values) <= _MOST))  # false for NaN
@@ -59,7 +63,7 @@ def broken(
     name: str, call: str, expected: str, got: object, advice: str, kind: type[TaskError] = TaskError
 ) -> TaskError:
     """The error of an environment that breaks its promise."""
-    return kind(f"{name}: {call}: expected {expected}, got {_short(got)}; {advice}")
+    return kind(f"{name}: {call}: expected {expected}, got {_cut(got, 400) if isinstance(got, str) else shown(got)}; {advice}")
 
 
 @contextmanager
@@ -110,6 +114,14 @@ def _dict(info: Any) -> dict[str, Any]:
     return info if isinstance(info, dict) else {}
 
 
-def _short(value: object) -> str:
-    text = value if isinstance(value, str) else repr(value)
-    return text if len(text) <= 100 else f"{text[:97]}..."
+def shown(value: object) -> str:
+    """What an environment has given, in at most a hundred characters: of a dict or a space of parts, its keys."""
+    keys = getattr(value, "spaces", value)
+    text = repr(value)
+    if len(text) > _LONGEST and isinstance(keys, dict):
+        text = f"a {type(value).__name__} of {', '.join(map(repr, keys))}"
+    return _cut(text, _LONGEST)
+
+
+def _cut(text: str, most: int) -> str:
+    return text if len(text) <= most else f"{text[: most - 3]}..."
