@@ -20,6 +20,7 @@ from metrpo import cli
 from metrpo.cli import main
 from metrpo.config import Config
 from metrpo.default_dir import default_run_dir
+from metrpo.experiments.figures import Run
 from metrpo.options import COMMANDS, parse
 from metrpo.presets import preset
 from metrpo.run import directory, doctor, machine
@@ -180,15 +181,24 @@ WRONG = [
     (["train", "Swimmer", "--preset", "slow"], "--preset"),
     (["train", "Swimmer", "--config.task", "Ant"], "--config.task"),
     (["train", "Swimmer", "--task", "Ant"], "--task"),
-    (["train", "Swimmer", "--iterations", "3", "--real-steps", "100"], "not allowed together"),
-    (["train"], "TASK"),
+    (["train", "Swimmer", "--iterations", "3", "--real-steps", "100"], "give --iterations or --real-steps, not both"),
+    (["tune", "--search", "a=1,2", "--iterations=3", "--real_steps=9"], "give --iterations or --real-steps, not both"),
+    (["train"], "metrpo: train needs a task: metrpo train TASK; metrpo tasks lists them"),
+    (["init", "--task", "x", "Swimmer"], "metrpo: init takes TASK without --task: metrpo init TASK"),
+    (["evaluate", "--dir=a"], "metrpo: evaluate takes DIR without --dir: metrpo evaluate DIR"),
+    (["improve", "--json"], "metrpo: improve needs a run directory: metrpo improve DIR"),
+    (["reproduce"], "metrpo: reproduce needs a figure: metrpo reproduce FIGURE"),
+    (["watch"], "metrpo: watch needs run directories, or folders with runs inside: metrpo watch runs"),
+    (["train", "Swimmer", "--policy.no-normalis"], "did you mean --policy.no-normalise?"),
+    (["sweep", "--set", "ensemble.membrs=3"], "unknown setting 'ensemble.membrs' (see: metrpo train --help-all)"),
+    (["train", "Swimmer", "--trpo.max-kl"], "see metrpo train --help-all"),
     (["train", "Swimmer", "--seed"], "--seed"),
     (["frobnicate"], "frobnicate"),
     (["evaluate", "nowhere"], "nowhere holds no policy"),
     (["render", "nowhere"], "nowhere holds no policy"),
     (["render", "nowhere", "--seed", "-1"], "seed: expected at least 0, got -1"),
     (["evaluate", "nowhere", "--seed", "-1"], "seed: expected at least 0, got -1"),
-    (["evaluate"], "DIR"),
+    (["evaluate"], "metrpo: evaluate needs a run directory: metrpo evaluate DIR"),
 ]
 
 
@@ -352,6 +362,31 @@ def test_switches_and_methods_read_the_right_way(capsys, monkeypatch):
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "ppo and ddpg are Stable-Baselines3's" in text, "the system"
     assert "This ppo is ours, within the ensemble" in text, "the improver"
+
+
+@pytest.mark.parametrize("preset_", ["fast", "paper"])
+def test_a_setting_that_is_on_or_off_has_both_forms_whatever_the_preset(capsys, preset_):
+    assert run("train", "Swimmer", "--preset", preset_, "--help-all") == 0
+    assert "--policy.normalise, --policy.no-normalise" in capsys.readouterr().out
+    for value, option in ((True, "--policy.normalise"), (False, "--policy.no-normalise")):
+        assert parse(["train", "Swimmer", "--preset", preset_, option]).policy.normalise is value
+
+
+def test_the_command_of_a_run_sets_what_is_on_or_off():
+    """Sweeps and searches give it to `metrpo train`."""
+    for value, preset_ in ((True, "paper"), (False, "fast")):
+        changed = Run("Swimmer", "me-trpo", 0, (("policy.normalise", value), ("deterministic", True)), preset_, "")
+        config, _ = cli._run(parse(["train", *changed.arguments]))
+        assert config == changed.config
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_no_empty_default_and_no_words_of_the_parser(capsys, command):
+    assert run(command, "--help-all") == 0
+    text = capsys.readouterr().out
+    assert not re.search(r"\(default: ?\)|mutually exclusive|can be overridden", text)
+    if command in ("report", "plot", "watch"):
+        assert "folders with runs inside. (required)" in " ".join(text.replace("│", " ").split())
 
 
 def test_help_shows_the_defaults_of_task_and_preset(capsys):

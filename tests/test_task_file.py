@@ -72,10 +72,12 @@ def test_a_module_of_the_current_folder_is_found(tmp_path, monkeypatch):
     write("my_task.py", MAKE, horizon=30)
     assert get_task("my_task:make").horizon == 30
     write("there/other_task.py", MAKE, horizon=40)
-    with pytest.raises(TaskError, match="expected a module other_task in .*, found none; go to the folder that holds"):
+    with pytest.raises(TaskError, match=r"expected a module other_task in .*, found none; go to the folder that holds"):
         get_task("other_task:make")
     write("needy_task.py", "import other_task")
-    with pytest.raises(TaskError, match=r"cannot import needy_task \(ModuleNotFoundError: No module named 'other_task'"):
+    with pytest.raises(
+        TaskError, match=r"cannot import needy_task \(ModuleNotFoundError: No module named 'other_task'"
+    ):
         get_task("needy_task:make")
 
 

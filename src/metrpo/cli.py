@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from metrpo.config import Config
+from metrpo.counting import counted
 from metrpo.errors import EpisodeError, MetrpoError, RunDirectoryError
 from metrpo.options import (
     Bench,
@@ -157,10 +158,13 @@ def _collect(command: Collect) -> int:
 
     with _attended(command.dir, SILENT if command.json else default_progress()) as progress:
         waiting = collect(command.dir, command.steps, command.data, progress, command.task)
-    found: dict[str, float] = {"episodes": len(waiting), "steps": sum(len(e.rewards) for e in waiting)}
-    found |= {"return": sum(float(e.rewards.sum()) for e in waiting) / max(len(waiting), 1)}
-    text = "{episodes} episodes of {steps:,} steps wait, mean return {return:.1f}"
-    print(json.dumps(found) if command.json else f"{text.format(**found)}; next: metrpo improve {command.dir}")
+    episodes, steps = len(waiting), sum(len(e.rewards) for e in waiting)
+    mean = sum(float(e.rewards.sum()) for e in waiting) / max(episodes, 1)
+    if command.json:
+        print(json.dumps({"episodes": episodes, "steps": steps, "return": mean}))
+        return 0
+    wait = f"{counted(episodes, 'episode')} of {counted(steps, 'step')} {'waits' if episodes == 1 else 'wait'}"
+    print(f"{wait}, mean return {mean:.1f}; next: metrpo improve {command.dir}")
     return 0
 
 
@@ -186,7 +190,8 @@ def _report(run_dir: Path, video: bool) -> None:
     from metrpo.run.video import VideoError
 
     last = read_metrics(run_dir / "metrics.csv")[-1]
-    print(f"return {last['return_real']:.1f} ± {last['return_real_std']:.1f} after {last['real_steps']:,} real steps")
+    steps = counted(int(last["real_steps"] or 0), "real step")
+    print(f"return {last['return_real']:.1f} ± {last['return_real_std']:.1f} after {steps}")
     files = {"curve": "curve.png", "metrics": "metrics.csv", "policy": "policy.npz"}
     for what, name in files.items():
         print(f"  {what:<8} {run_dir / name}", flush=True)
@@ -203,8 +208,9 @@ def _evaluate(command: Evaluate) -> int:
     from metrpo.evaluation import evaluate
 
     result = evaluate(command.dir, command.task, command.episodes, command.seed).summary()
-    text = "{task}: return {mean:.2f} ± {std:.2f} (min {min:.2f}, max {max:.2f}) over {episodes} episodes, seed {seed}"
-    print(json.dumps(result) if command.json else text.format(**result))
+    text = "{task}: return {mean:.2f} ± {std:.2f} (min {min:.2f}, max {max:.2f}) over {over}, seed {seed}"
+    over = counted(result["episodes"], "episode")
+    print(json.dumps(result) if command.json else text.format(**result, over=over))
     return 0
 
 
@@ -287,7 +293,10 @@ def _reproduce(command: Reproduce) -> int:
     if command.json:
         print(json.dumps(numbers))
     if failed:
-        print(f"metrpo: {len(failed)} of {len(runs)} runs failed; the same command tries again", file=sys.stderr)
+        print(
+            f"metrpo: {len(failed)} of {counted(len(runs), 'run')} failed; the same command tries again",
+            file=sys.stderr,
+        )
     return 1 if failed else 0
 
 
@@ -301,7 +310,7 @@ def _sweep(command: Sweep) -> int:
     from metrpo.experiments.sweep import as_typed, from_file
 
     runs = (as_typed(command) if command.spec is None else from_file(command.spec)).runs()
-    print(f"{command.out}: {len(runs)} runs", flush=True)
+    print(f"{command.out}: {counted(len(runs), 'run')}", flush=True)
     if command.dry_run:
         for run in runs:
             print(f"{run.name}:  metrpo train {shlex.join(run.arguments)}")
@@ -313,7 +322,10 @@ def _sweep(command: Sweep) -> int:
         _say(f"metrpo: stopped; {command.out} keeps every finished iteration. The same command goes on.")
         raise
     if failed:
-        print(f"metrpo: {len(failed)} of {len(runs)} runs failed; the same command tries again", file=sys.stderr)
+        print(
+            f"metrpo: {len(failed)} of {counted(len(runs), 'run')} failed; the same command tries again",
+            file=sys.stderr,
+        )
     return 1 if failed else 0
 
 
@@ -347,7 +359,7 @@ def _tune(command: Tune) -> int:
         print(picture or f"{out}: nothing to draw yet")
     if found.failed:
         logs = f"the ends of their logs stand in {out}"
-        print(f"metrpo: {len(found.failed)} of {len(found.records)} trials failed; {logs}", file=sys.stderr)
+        print(f"metrpo: {len(found.failed)} of {counted(len(found.records), 'trial')} failed; {logs}", file=sys.stderr)
     return 1 if found.failed else 0
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from metrpo.counting import counted
 from metrpo.errors import ConfigError, TaskError
 from metrpo.run.policy_file import LoadedPolicy, load_policy
 from metrpo.run.task_file import task_of_run
@@ -105,7 +106,7 @@ def _require_fit(policy: LoadedPolicy, task: Task) -> None:
     has = (policy.info.observation_size, policy.info.action_size)
     if has != (task.state_size, task.action_size):
         raise TaskError(
-            f"{task.name}: expected a policy of {task.state_size} observed numbers and {task.action_size} actions, got "
-            f"one of {has[0]} and {has[1]}, trained on {brief(policy.info.task)}; name that task, or train one for "
-            "this"
+            f"{task.name}: expected a policy of {counted(task.state_size, 'observed number')} and "
+            f"{counted(task.action_size, 'action')}, got one of {has[0]} and {has[1]}, trained on "
+            f"{brief(policy.info.task)}; name that task, or train one for this"
         )

@@ -83,6 +83,8 @@ def shown(kind: Any, default: Any, only: Collection[str] | None = None) -> tuple
         hint: Any = hints[field.name]
         if only is not None and field.name not in only:
             hint = Annotated[hint, tyro.conf.Suppress]
+        elif field.default is dataclasses.MISSING and value is dataclasses.MISSING and "tuple" in str(hint):
+            hint = Annotated[hint, arg(help_behavior_hint="(required)")]  # it may be empty, to the parser
         elif value is None or isinstance(value, bool) or value == ():
             hint = Annotated[hint, arg(help_behavior_hint="")]
         else:

@@ -18,7 +18,8 @@ from metrpo.experiments.means import Means
 from metrpo.helptext import FEW, overview, shown
 from metrpo.words import command_of, joined, lists_of, understood
 
-_BUDGET = tyro.conf.create_mutex_group(required=False)
+Switch = Annotated[bool, FlagCreatePairsOff]
+"""A bool with one option, which turns it: --json, or --no-video. Settings of a run have two, for presets differ."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,9 @@ class Run(Config):
     improver: Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic"] = "trpo"
     """How the policy is improved on imagined steps: by score functions (trpo, ppo, vpg) or through the models
     (bptt). This ppo is ours, within the ensemble; --ppo.clip and the like are its settings."""
-    iterations: Annotated[int, _BUDGET] = 10
-    """Outer iterations; may be raised later to go on with a finished run."""
-    real_steps: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
+    iterations: int = 10
+    """The budget: outer iterations; may be raised later to go on with a finished run."""
+    real_steps: Annotated[int | None, arg(metavar="INT")] = None
     """Instead of --iterations: go on until this many real steps have been collected; 0: learn from --data alone."""
     data: Annotated[str | None, arg(metavar="FILE")] = None
     """Logged transitions to begin with: minari:NAME or an .npz of states, actions, rewards, next_states, terminated."""
@@ -64,7 +65,7 @@ class Train(Run):
     Every setting starts from the task's preset; metrpo train --help-all lists all.
     """
 
-    video: Annotated[bool, arg(help="Do not record the final policy as a video.")] = True
+    video: Annotated[Switch, arg(help="Do not record the final policy as a video.")] = True
 
 
 @dataclass(frozen=True)
@@ -95,12 +96,12 @@ class Collect:
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """The run directory."""
     steps: Annotated[int | None, arg(metavar="INT")] = None
-    """Play until the episodes that wait have so many steps; default: the run's collect.steps."""
+    """Play until at least this many steps wait; default: the run's collect.steps."""
     data: Annotated[str | None, arg(metavar="FILE")] = None
     """Instead: minari:NAME, or an .npz of logged states, actions, rewards, next_states, terminated."""
     task: Annotated[str | None, arg(metavar="TASK")] = None
-    """Where the run's task is, if its file has moved."""
-    json: bool = False
+    """Where the run's task is, if its file or module has moved."""
+    json: Switch = False
     """Print JSON."""
 
     def __post_init__(self) -> None:
@@ -119,8 +120,8 @@ class Improve:
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """The run directory."""
     task: Annotated[str | None, arg(metavar="TASK")] = None
-    """Where the run's task is, if its file has moved."""
-    json: bool = False
+    """Where the run's task is, if its file or module has moved."""
+    json: Switch = False
     """Print the iteration's metrics as JSON."""
 
 
@@ -140,8 +141,8 @@ class Evaluate:
     seed: int = 0
     """Decides the start states."""
     task: Annotated[str | None, arg(metavar="TASK")] = None
-    """Where the run's task is, if its file has moved."""
-    json: bool = False
+    """Where the run's task is, if its file or module has moved."""
+    json: Switch = False
     """Print JSON."""
 
 
@@ -161,7 +162,7 @@ class Render:
     seed: int = 0
     """Decides the start state."""
     task: Annotated[str | None, arg(metavar="TASK")] = None
-    """Where the run's task is, if its file has moved."""
+    """Where the run's task is, if its file or module has moved."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +190,7 @@ class Tasks:
         metrpo tasks --json
     """
 
-    json: bool = False
+    json: Switch = False
     """Print JSON."""
 
 
@@ -202,7 +203,7 @@ class Doctor:
         metrpo doctor --json
     """
 
-    json: bool = False
+    json: Switch = False
     """Print JSON."""
 
 
@@ -217,12 +218,12 @@ class Bench:
         metrpo bench --peers --rounds 9 --json > bench.json
     """
 
-    peers: bool = False
+    peers: Switch = False
     """Measure mbrl-lib, sb3-contrib and PyTorch too; the first time installs them (gigabytes), apart from ours."""
     rounds: int = 7
     """How often each piece is timed."""
-    iterations: Annotated[bool, arg(help="Do not time whole outer iterations and process starts (minutes).")] = True
-    json: bool = False
+    iterations: Annotated[Switch, arg(help="Do not time whole outer iterations and process starts (minutes).")] = True
+    json: Switch = False
     """Print JSON."""
 
     def __post_init__(self) -> None:
@@ -252,8 +253,8 @@ class Reproduce:
     """Seeds 0, 1, ... of each system; default: the scale's."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of the runs and of figures/; default: runs/reproduce-<scale>."""
-    run: Annotated[bool, arg(help="Run nothing: draw what is there.")] = True
-    json: bool = False
+    run: Annotated[Switch, arg(help="Run nothing: draw what is there.")] = True
+    json: Switch = False
     """Print the figures' numbers as JSON."""
     means: Annotated[Means, OmitArgPrefixes] = field(default_factory=Means)
 
@@ -289,9 +290,9 @@ class Sweep:
     """Systems, as metrpo train takes them."""
     seeds: Annotated[tuple[str, ...], arg(metavar="SEEDS...")] = ("0:3",)
     """Seeds: numbers, ranges such as 0:5 (0 to 4), or lists such as 0,2,7."""
-    iterations: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
+    iterations: Annotated[int | None, arg(metavar="INT")] = None
     """Outer iterations of every run; default: the preset's. May be raised later to go on with finished runs."""
-    real_steps: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
+    real_steps: Annotated[int | None, arg(metavar="INT")] = None
     """Instead of --iterations: real steps of every run."""
     preset: Preset = "fast"
     """What all other settings start from."""
@@ -299,7 +300,7 @@ class Sweep:
     """Settings and their values: ensemble.members=1,5,10 or ensemble.hidden=[200,200],[512]."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("runs/sweep")
     """Folder of the runs: <task>/<system>,<setting>=<value>/seed-<seed>."""
-    dry_run: bool = False
+    dry_run: Switch = False
     """Only say what would be run."""
     means: Annotated[Means, OmitArgPrefixes] = field(default_factory=Means)
 
@@ -338,9 +339,9 @@ class Tune:
     """Trials in all; may be raised later."""
     seeds: Annotated[tuple[str, ...], arg(metavar="SEEDS...")] = ("0:2",)
     """Seeds of every trial, side by side: numbers, ranges such as 0:3 (0 to 2), or lists such as 0,2,7."""
-    iterations: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
+    iterations: Annotated[int | None, arg(metavar="INT")] = None
     """Outer iterations of every run; default: the preset's."""
-    real_steps: Annotated[int | None, _BUDGET, arg(metavar="INT")] = None
+    real_steps: Annotated[int | None, arg(metavar="INT")] = None
     """Instead of --iterations: real steps of every run."""
     system: Annotated[System, arg(metavar="NAME")] = "me-trpo"
     """System, as metrpo train takes it."""
@@ -355,9 +356,9 @@ class Tune:
     """Trials at a time, on cores of their own; default: as many as their seeds have a core each."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
     """Folder of the study, its picture and the runs: <task>/trial-<number>/seed-<seed>; default: runs/tune-<task>."""
-    json: bool = False
+    json: Switch = False
     """Print all trials and the best one as JSON."""
-    dry_run: bool = False
+    dry_run: Switch = False
     """Only say what would be searched."""
 
     def __post_init__(self) -> None:
@@ -389,11 +390,11 @@ class Report:
     """Run directories, or folders with runs inside."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("report.html")
     """File to write."""
-    json: bool = False
+    json: Switch = False
     """Print what the page says as JSON, besides writing it."""
 
     def __post_init__(self) -> None:
-        _require_dirs(self.dirs)
+        _require_dirs("report", self.dirs)
 
 
 @dataclass(frozen=True)
@@ -416,7 +417,7 @@ class Plot:
     """Column of metrics.csv or diagnostics.csv to draw, such as gap, outside, error_T, error_10_3 or improved_0."""
 
     def __post_init__(self) -> None:
-        _require_dirs(self.dirs)
+        _require_dirs("plot", self.dirs)
 
 
 @dataclass(frozen=True)
@@ -433,20 +434,20 @@ class Watch:
     """Run directories, or folders with runs inside."""
     every: float = 5.0
     """Seconds between two looks."""
-    once: bool = False
+    once: Switch = False
     """Look once."""
-    json: bool = False
+    json: Switch = False
     """Print JSON, once."""
 
     def __post_init__(self) -> None:
-        _require_dirs(self.dirs)
+        _require_dirs("watch", self.dirs)
         if not 0.1 <= self.every < float("inf"):
             raise ConfigError(f"every: expected at least 0.1 seconds, got {self.every}")
 
 
-def _require_dirs(dirs: tuple[Path, ...]) -> None:
+def _require_dirs(command: str, dirs: tuple[Path, ...]) -> None:
     if not dirs:
-        raise ConfigError("expected at least one run directory or folder with runs, got none; try: runs")
+        raise ConfigError(f"{command} needs run directories, or folders with runs inside: metrpo {command} runs")
 
 
 Command = (
@@ -532,5 +533,4 @@ def _show(kind: type, default: Any, name: str, only: Collection[str] | None = No
 
 def _tyro(kind: type, default: Any, arguments: list[str]) -> object:
     name, *rest = arguments
-    options = (OmitSubcommandPrefixes, FlagCreatePairsOff)
-    return tyro.cli(kind, prog=f"metrpo {name}", default=default, args=rest, config=options)
+    return tyro.cli(kind, prog=f"metrpo {name}", default=default, args=rest, config=(OmitSubcommandPrefixes,))

@@ -134,7 +134,7 @@ def override(config: Config, values: Overrides) -> Config:
 
 def _replace(node: Any, path: list[str], value: Any, name: str) -> Any:
     if not dataclasses.is_dataclass(node) or path[0] not in {f.name for f in dataclasses.fields(node)}:
-        raise ConfigError(f"unknown setting {name!r} (see: metrpo train --help)")
+        raise ConfigError(f"unknown setting {name!r} (see: metrpo train --help-all)")
     if len(path) > 1:
         value = _replace(getattr(node, path[0]), path[1:], value, name)
     else:

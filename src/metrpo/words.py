@@ -18,6 +18,13 @@ from metrpo.errors import ConfigError
 
 T = TypeVar("T")
 _KINDS = {"INT": "a whole number", "FLOAT": "a number"}
+_BUDGET = ("--iterations", "--real-steps")
+_NEEDS = {
+    "DIR": ("a run directory", ""),
+    "TASK": ("a task", "; metrpo tasks lists them"),
+    "FIGURE": ("a figure", "; metrpo reproduce --help lists them"),
+}
+"""The word that a command is about -> what it is, and how to find one."""
 
 
 def joined(arguments: Sequence[str], lists: Collection[str]) -> list[str]:
@@ -65,6 +72,7 @@ def understood(parse: Callable[[], T], kind: type, arguments: Sequence[str]) -> 
 
     `kind` is the command's class, `arguments` are its words. Raises `ConfigError`.
     """
+    _require_one_budget(arguments)
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(printed), _wide():
@@ -72,18 +80,44 @@ def understood(parse: Callable[[], T], kind: type, arguments: Sequence[str]) -> 
     except SystemExit as end:
         if not end.code:
             raise
+    if needed := _needed(printed.getvalue(), kind, arguments):
+        raise ConfigError(needed) from None
     raise ConfigError(f"{arguments[0]}: {_complaint(printed.getvalue(), kind, arguments)}") from None
+
+
+def _require_one_budget(arguments: Sequence[str]) -> None:
+    options = [word.partition("=")[0].replace("_", "-") for word in arguments]
+    if all(option in options for option in _BUDGET):
+        raise ConfigError(f"{arguments[0]}: give {' or '.join(_BUDGET)}, not both")
+
+
+def _needed(text: str, kind: type, arguments: Sequence[str]) -> str | None:
+    """What to type where the word that a command is about is missing, or given as an option; else None."""
+    command = arguments[0]
+    for name, metavar in _positionals(kind):
+        if any(word.partition("=")[0] == f"--{name}" for word in arguments):
+            return f"{command} takes {metavar} without --{name}: metrpo {command} {metavar}"
+        if re.search(rf"^\W*Required .*\n(?:.*\n)*?\W*{re.escape(metavar)} ", text, re.MULTILINE):
+            what, more = _NEEDS[metavar]
+            return f"{command} needs {what}: metrpo {command} {metavar}{more}"
+    return None
+
+
+def _positionals(kind: type) -> Iterator[tuple[str, str]]:
+    """Name and metavar of the words of a command that belong to no option."""
+    for name, hint in typing.get_type_hints(kind, include_extras=True).items():
+        marks = getattr(hint, "__metadata__", ())
+        if tyro.conf.Positional in marks:
+            yield name, next(mark.metavar for mark in marks if getattr(mark, "metavar", None))
 
 
 def _complaint(text: str, kind: type, arguments: Sequence[str]) -> str:
     """The parser's own words, a title and paragraphs between rules, in short."""
     bare = (line.strip("│|╭╮╰╯─+- ") for line in text.splitlines())
     title, *lines = [line for line in bare if line] or ["Nothing"]
-    see = f"see metrpo {arguments[0]} --help"
+    see = f"see metrpo {arguments[0]} {_help(arguments[0])}"
     if title.startswith("Unrecognized"):
         return _unknown(kind, arguments)
-    if title.startswith("Required") and len(lines) > 2:
-        return f"expected {lines[1].split()[0]}: {lines[2].removesuffix(' (required)')}"
     said = lines[0] if lines else title
     if wrong := re.match(r"Error parsing (--[\w.-]+)", said):
         usage = re.search(rf"^\W*{re.escape(wrong[1])} (.+?)\s*$", text, re.MULTILINE)
@@ -124,7 +158,9 @@ def options_of(kind: type, prefix: str = "") -> list[str]:
         if isinstance(base, type) and dataclasses.is_dataclass(base):
             found += options_of(base, prefix if tyro.conf.OmitArgPrefixes in marks else f"{name}.")
         else:
-            found.append(f"--no-{name}" if field.default is True else f"--{name}")
+            found += [f"--no-{name}"] if field.default is True else [f"--{name}"]
+            if base is bool and tyro.conf.FlagCreatePairsOff not in marks:
+                found.append(f"--{prefix}no-{name.removeprefix(prefix)}")
     return found
 
 
@@ -136,9 +172,13 @@ def _unknown(kind: type, arguments: Sequence[str]) -> str:
             continue
         short = [o for o in options if o.rpartition(".")[2] == option.lstrip("-")]
         near = short[:1] or difflib.get_close_matches(option, options, 1)
-        more = "--help-all" if command in ("train", "init") else "--help"
-        return f"unknown option {word.partition('=')[0]}{_meant(near)} metrpo {command} {more} lists all"
+        return f"unknown option {word.partition('=')[0]}{_meant(near)} metrpo {command} {_help(command)} lists all"
     return f"expected fewer words that belong to no option; see metrpo {command} --help"
+
+
+def _help(command: str) -> str:
+    """The option that lists all of a command's options."""
+    return "--help-all" if command in ("train", "init") else "--help"
 
 
 def _meant(near: Sequence[str]) -> str:

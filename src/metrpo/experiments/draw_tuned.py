@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from metrpo.counting import counted
 from metrpo.experiments.space import Choices, Span
 from metrpo.experiments.tuned import Record, Tuned
 from metrpo.run.files import atomic_write
@@ -46,7 +47,7 @@ def draw(tuned: Tuned, path: Path) -> bool:
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
     figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=9)
-    title = f"{tuned.search.task}: {len(tuned.records)} trials of {len(tuned.search.seeds)} seeds"
+    title = f"{tuned.search.task}: {counted(len(tuned.records), 'trial')} of {counted(len(tuned.search.seeds), 'seed')}"
     figure.suptitle(title, fontsize=12, fontweight="bold", parse_math=False)
     content = io.BytesIO()
     figure.savefig(content, format="png", metadata={"Software": None})

@@ -198,11 +198,11 @@ class Run:
         words = [self.task, "--system", self.system, "--preset", self.preset, "--seed", str(self.seed)]
         usual = flatten(preset(self.task, self.preset, self.system))
         for name, value in self.overrides:
-            option = name.replace("_", "-")
+            group, dot, own = (option := name.replace("_", "-")).rpartition(".")
             if not isinstance(value, bool):
                 words += [f"--{option}", *map(str, value if isinstance(value, tuple) else (value,))]
             elif value != usual[name]:
-                words.append(f"--{option}" if value else f"--no-{option}")
+                words.append(f"--{option}" if value else f"--{group}{dot}no-{own}")
         return words
 
 

@@ -10,6 +10,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+from metrpo.counting import counted
 from metrpo.errors import MetrpoError
 from metrpo.experiments.figures import Run
 from metrpo.experiments.means import Means
@@ -73,7 +74,7 @@ def run_locally(runs: list[Run], out: Path, means: Means, tell: Tell) -> list[Ru
 def _stop(children: list[_Child], tell: Tell) -> None:
     """Ends the runs: asked once, each finishes its iteration; when this is interrupted, it asks them once more."""
     if children:
-        tell(f"stopping {len(children)} runs after their iteration; once more stops them at once")
+        tell(f"stopping {counted(len(children), 'run')} after their iteration; once more stops them at once")
     try:
         _ask_to_stop(children)
     except BaseException:

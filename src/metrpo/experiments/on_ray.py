@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from metrpo.counting import counted
 from metrpo.errors import MetrpoError
 from metrpo.experiments import on_node, sent
 from metrpo.experiments.figures import Run
@@ -66,7 +67,8 @@ def run_on_ray(runs: list[Run], out: Path, means: Means, tell: Tell) -> list[Run
                     failed.append(run)
             if time.monotonic() - reported > _REPORT:
                 reported = time.monotonic()
-                tell(f"  {len(waiting) + len(under_way)} runs to go; {_resources(ray)}; for each: metrpo watch {out}")
+                left = counted(len(waiting) + len(under_way), "run")
+                tell(f"  {left} to go; {_resources(ray)}; for each: metrpo watch {out}")
         if heard:
             _stop(ray, list(under_way), heard, tell)
     return failed

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from metrpo.counting import counted
 from metrpo.experiments.draw import draw
 from metrpo.experiments.figures import FIGURES, Run
 from metrpo.experiments.reproduce import differences, runs_there
@@ -52,7 +53,7 @@ def _tell_about(run: Run, out: Path, tell: Callable[[str], None]) -> None:
         tell(f"{run.name}: not begun")
         return
     if not is_finished(run, out):
-        tell(f"{run.name}: not finished, {rows_of(run, out)[-1]['real_steps']:,} real steps so far")
+        tell(f"{run.name}: not finished, {counted(int(rows_of(run, out)[-1]['real_steps'] or 0), 'real step')} so far")
     if other := differences(run, out):
         told = ", ".join(f"{name} {was} (today {now})" for name, (was, now) in other.items())
         tell(f"{run.name}: made with other settings: {told}")

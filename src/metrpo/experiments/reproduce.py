@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from metrpo.config import difference, from_json
+from metrpo.counting import counted
 from metrpo.experiments.figures import FIGURES, Run, run_of
 from metrpo.experiments.local import run_locally
 from metrpo.experiments.means import Backend, Means
@@ -46,5 +47,5 @@ def reproduce(runs: list[Run], out: Path, means: Means, tell: Tell) -> list[Run]
     Raises `MetrpoError` when `out` cannot be written or the backend is not there.
     """
     missing = [run for run in runs if not is_finished(run, out)]
-    tell(f"{len(runs) - len(missing)} of {len(runs)} runs are finished; {len(missing)} to go")
+    tell(f"{len(runs) - len(missing)} of {counted(len(runs), 'run')} are finished; {len(missing)} to go")
     return BACKENDS[means.backend](missing, out, means, tell) if missing else []

@@ -133,7 +133,7 @@ def _range(name: str, kind: Any, text: str) -> Range:
         raise ConfigError(f"search: {name}: expected {_FORMS}; got {text!r}")
     if kind not in (int, float):
         raise ConfigError(
-            f"search: {name}: expected choices, for it is no number (see: metrpo train --help); got {text!r}"
+            f"search: {name}: expected choices, for it is no number (see: metrpo train --help-all); got {text!r}"
         )
     try:
         low, high = kind(found["low"]), kind(found["high"])
@@ -156,6 +156,6 @@ def _kind(name: str) -> Any:
     for part in name.split("."):
         hints = typing.get_type_hints(kind) if isinstance(kind, type) and kind not in (int, float, bool, str) else {}
         if part not in hints:
-            raise ConfigError(f"search: unknown setting {name!r} (see: metrpo train --help)")
+            raise ConfigError(f"search: unknown setting {name!r} (see: metrpo train --help-all)")
         kind = hints[part]
     return typing.get_args(kind)[0] if isinstance(kind, types.UnionType) else kind

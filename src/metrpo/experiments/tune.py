@@ -10,6 +10,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING
 
+from metrpo.counting import counted
 from metrpo.errors import MetrpoError
 from metrpo.experiments.figures import Run
 from metrpo.experiments.local import shares_of_cores
@@ -83,7 +84,7 @@ class _Tuning:
         of = [trial.state.name for trial in self._study.get_trials(deepcopy=False)]
         broken_off = [number for number, state in enumerate(of) if state == "RUNNING"]
         done = len(of) - len(broken_off) - of.count("WAITING")
-        self._tell(f"{done} of {self._search.trials} trials are finished, {len(broken_off)} broken off")
+        self._tell(f"{done} of {counted(self._search.trials, 'trial')} are finished, {len(broken_off)} broken off")
         try:
             while True:
                 while self._free and (broken_off or self._wants_more()):
@@ -189,7 +190,7 @@ class _Tuning:
         elif going.pruned is not None:
             self._study.tell(trial, state=_state("PRUNED"))
             self._hopeful = True
-            self._tell(f"trial {trial.number}: pruned after {going.pruned} iterations, in {took}")
+            self._tell(f"trial {trial.number}: pruned after {counted(going.pruned, 'iteration')}, in {took}")
         else:
             why = f"the return is {value}" if whole else self._why(going)
             trial.set_user_attr("failure", why)
@@ -209,7 +210,9 @@ class _Tuning:
     def _stop_all(self) -> None:
         """Ends what is under way: each run finishes its iteration, and when this is interrupted is asked once more."""
         if self._going:
-            self._tell(f"stopping {len(self._going)} trials after their iteration; once more stops them at once")
+            self._tell(
+                f"stopping {counted(len(self._going), 'trial')} after their iteration; once more stops them at once"
+            )
         try:
             self._end_all()
         except BaseException:

@@ -14,6 +14,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from metrpo.config import flatten
+from metrpo.counting import counted
 from metrpo.experiments.search import OBJECTIVE, Search
 
 if TYPE_CHECKING:
@@ -100,7 +102,8 @@ class Tuned:
         steps = sum(r.real_steps for r in self.records)
         console.print(self._table())
         told = ", ".join(f"{n} {state}" for state, n in count.items() if n)
-        lines = [f"{len(self.records)} trials: {told or 'none is over'}; {steps:,} real steps. Return: {OBJECTIVE}."]
+        trials, taken = counted(len(self.records), "trial"), counted(steps, "real step")
+        lines = [f"{trials}: {told or 'none is over'}; {taken}. Return: {OBJECTIVE}."]
         if self.importance:
             parts = ", ".join(f"{name} {share:.0%}" for name, share in self.importance.items())
             lines.append(f"importance (PED-ANOVA, of the complete trials): {parts}")
@@ -159,14 +162,18 @@ def _importance(study: Study, search: Search) -> dict[str, float]:
 
 def describe(search: Search, out: Path) -> str:
     """What is searched and where, in words; and what a trial runs."""
-    lines = [
-        f"{out}: {search.trials} trials of {len(search.seeds)} seeds, {search.steps} iterations each; searched are"
-    ]
+    trials, seeds = counted(search.trials, "trial"), counted(len(search.seeds), "seed")
+    budget = counted(*((search.steps, "iteration") if search.real_steps is None else (search.real_steps, "real step")))
+    lines = [f"{out}: {trials} of {seeds}, {budget} each; searched are"]
     usual = search.usual or {}
     for name, over in search.space.items():
         lines.append(f"  {name} = {over}" + (f" (the preset has {_number(usual[name])})" if usual else ""))
     if not usual:
-        lines.append("the preset's own settings are not among these, so no trial has them")
+        values = flatten(search.base)
+        others = [
+            f"{n} = {_number(values[n])} is not in {o}" for n, o in search.space.items() if not o.holds(values[n])
+        ]
+        lines.append(f"No trial uses the preset's own values: {', '.join(others)}.")
     values = search.usual or {name: over.outermost[0] for name, over in search.space.items()}
     what = "the first" if usual else "one"
     lines.append(f"{what} of them: metrpo train {shlex.join(search.runs(0, values)[0].arguments)}")

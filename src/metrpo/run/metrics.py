@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from metrpo.counting import counted
 from metrpo.errors import RunDirectoryError
 from metrpo.untrusted import text_of
 
@@ -107,7 +108,7 @@ def checked(rows: Any, iteration: int) -> list[Row]:
     if rows and not {"iteration", "real_steps", "wall_seconds"} <= rows[0].keys():
         raise ValueError("expected the columns iteration, real_steps and wall_seconds")
     if [row["iteration"] for row in rows] != list(range(1, iteration + 1)):
-        raise ValueError(f"expected a row for each of {iteration} iterations, got {len(rows)}")
+        raise ValueError(f"expected a row for each of {counted(iteration, 'iteration')}, got {len(rows)}")
     return rows
 
 

@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TextIO
 
+from metrpo.counting import counted
+
 if TYPE_CHECKING:
     from rich import progress as rich_progress
     from rich.console import Console
@@ -236,10 +238,11 @@ def duration(seconds: float) -> str:
 
 
 def _resuming(where: str, iteration: int, of: int | None, real_steps: int) -> str:
+    steps = counted(real_steps, "real step")
     if of is not None and iteration > of:
-        return f"{where} is finished: {of} iterations, {real_steps:,} real steps; a larger budget goes on"
+        return f"{where} is finished: {counted(of, 'iteration')}, {steps}; a larger budget goes on"
     budget = "" if of is None else f" of {of}"
-    return f"resuming {where} at iteration {iteration}{budget}, {real_steps:,} real steps"
+    return f"resuming {where} at iteration {iteration}{budget}, {steps}"
 
 
 def _heading(iteration: int, of: int | None) -> str:

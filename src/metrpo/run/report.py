@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from metrpo.counting import counted
 from metrpo.run.files import atomic_write
 from metrpo.run.metrics import Row
 
@@ -42,7 +43,7 @@ def draw_curve(rows: Sequence[Row], path: Path, title: str, yardsticks: Mapping[
     best = _column(rows, "return_real")
     if np.isfinite(best).any():
         above.set_title(
-            f"last {best[-1]:.1f}, best {np.nanmax(best):.1f} after {len(rows)} iterations",
+            f"last {best[-1]:.1f}, best {np.nanmax(best):.1f} after {counted(len(rows), 'iteration')}",
             fontsize=10,
             color="#555555",
         )

@@ -11,6 +11,7 @@ from typing import Literal
 import numpy as np
 
 from metrpo.config import Config
+from metrpo.counting import counted
 from metrpo.run.metrics import Row
 from metrpo.seeing.runs import column
 
@@ -63,7 +64,9 @@ def horizons(rows: Sequence[Row]) -> list[str]:
 
 def after(steps: str) -> str:
     """Such a number in words."""
-    return {"1": "1 step", "T": "an imagined episode"}.get(steps, f"{steps} steps")
+    return {"1": "1 step", "T": "an imagined episode"}.get(
+        steps, counted(int(steps), "step") if steps.isdigit() else steps
+    )
 
 
 def standard_error(rows: Sequence[Row], config: Config) -> np.ndarray:

@@ -19,8 +19,3 @@ def swatches(given: Sequence[tuple[str, str]]) -> str:
         return ""
     items = "".join(f'<li><i class="swatch {style}"></i>{escape(name)}</li>' for style, name in given)
     return f'<ul class="legend">{items}</ul>'
-
-
-def count(n: int, what: str) -> str:
-    """So many of something, in words."""
-    return f"{n} {what}{'' if n == 1 else 's'}"

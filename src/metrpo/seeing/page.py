@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from metrpo.counting import counted
 from metrpo.run.progress import duration
 from metrpo.seeing import svg
-from metrpo.seeing.figure import count
 from metrpo.seeing.health import examine
 from metrpo.seeing.panels import Budget, Seen, task_section
 from metrpo.seeing.runs import Found, Group, SeenRun, group, is_finished, settings
@@ -93,7 +93,7 @@ def _summary(seen: list[Seen]) -> str:
     steps = sum(int(s.run.rows[-1]["real_steps"] or 0) for s in seen)
     unfinished = sum(not is_finished(s.run) for s in seen)
     open_ = f"; {unfinished} not finished" if unfinished else ""
-    return f"{count(len(seen), 'run')}, {steps:,} real steps together{open_}."
+    return f"{counted(len(seen), 'run')}, {counted(steps, 'real step')} together{open_}."
 
 
 def _health(seen: list[Seen], found: Found) -> str:
@@ -101,14 +101,14 @@ def _health(seen: list[Seen], found: Found) -> str:
     noted = [s for s in seen if s.concerns and s not in warned]
     several = len({s.group.task for s in seen}) > 1
     if warned:
-        verdict = f'<p class="verdict bad">Warnings in {len(warned)} of {count(len(seen), "run")}</p>'
+        verdict = f'<p class="verdict bad">Warnings in {len(warned)} of {counted(len(seen), "run")}</p>'
     else:
-        verdict = f'<p class="verdict good">No warnings in {count(len(seen), "run")}</p>'
+        verdict = f'<p class="verdict good">No warnings in {counted(len(seen), "run")}</p>'
     parts = ['<section id="health"><h2>Health</h2>', verdict, *(_card(s, several) for s in warned)]
     if noted:
         cards = "".join(_card(s, several) for s in noted)
         inside = " open" if not warned and len(noted) <= 2 else ""
-        parts.append(f"<details{inside}><summary>Notes on {count(len(noted), 'more run')}</summary>{cards}</details>")
+        parts.append(f"<details{inside}><summary>Notes on {counted(len(noted), 'more run')}</summary>{cards}</details>")
     if skipped := _skipped(found):
         items = "".join(f"<li><code>{escape(str(path))}</code>: {escape(why)}</li>" for path, why in skipped)
         parts.append(f'<div class="card skipped"><h3>Not in this report</h3><ul>{items}</ul></div>')

@@ -11,11 +11,12 @@ from urllib.parse import quote
 
 import numpy as np
 
+from metrpo.counting import counted
 from metrpo.run.metrics import is_clock
 from metrpo.seeing import svg
 from metrpo.seeing.concern import Concern
 from metrpo.seeing.curves import RATIOS, curve, is_far, x_axis
-from metrpo.seeing.figure import count, figure, swatches
+from metrpo.seeing.figure import figure, swatches
 from metrpo.seeing.runs import Group, SeenRun
 from metrpo.seeing.svg import Line, bars, chart
 from metrpo.seeing.trust import trust_of
@@ -81,7 +82,7 @@ def task_section(task: str, seen: list[Seen], groups: list[Group], folder: Path,
     trust = [_trust(s, x, x_label) for s in seen]
     if any(trust):
         inside = f'{swatches([("real", "real"), ("imagined", "imagined")])}<div class="grid">{"".join(trust)}</div>'
-        folded = f"<details><summary>{count(len(seen), 'run')}</summary>{inside}</details>"
+        folded = f"<details><summary>{counted(len(seen), 'run')}</summary>{inside}</details>"
         parts.append(f"<h3>Real and imagined return</h3>{inside if len(seen) <= 12 else folded}")
     several = len(groups) > 1
     still = [title for name, title, *_ in _QUANTITIES if _is_zero(seen, name)]
@@ -209,7 +210,10 @@ def _of_run(s: Seen, x: str, x_label: str) -> str:
 
 def _legend(groups: list[Group], colours: dict[int, str]) -> str:
     return swatches(
-        [(colours[id(g)], f"{g.label} ({count(len(g.runs), 'seed')})" if len(g.runs) > 1 else g.label) for g in groups]
+        [
+            (colours[id(g)], f"{g.label} ({counted(len(g.runs), 'seed')})" if len(g.runs) > 1 else g.label)
+            for g in groups
+        ]
     )
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from metrpo.counting import counted
 from metrpo.errors import ConfigError
 from metrpo.run.files import atomic_write
 from metrpo.seeing.curves import RATIOS, curve, is_far
@@ -74,7 +75,7 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
                 for seed in c.seeds:
                     axes.plot(*seed, **style, linewidth=0.7, alpha=0.4)
                 axes.fill_between(c.x, c.low, c.high, color=style["color"], alpha=0.15, linewidth=0)
-            name = f"{g.label} ({len(c.seeds)} seeds)" if len(c.seeds) > 1 else g.label
+            name = f"{g.label} ({counted(len(c.seeds), 'seed')})" if len(c.seeds) > 1 else g.label
             marker = "o" if len(c.seeds) == 1 and len(c.x) <= _DOTS else ""
             axes.plot(c.x, c.mean, **style, linewidth=2, marker=marker, markersize=3.5, label=name)
         axes.set_title(task, fontsize=11, parse_math=False)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from metrpo.config import Config
+from metrpo.counting import counted
 from metrpo.run.metrics import Row
 from metrpo.seeing.concern import Concern, iteration_at, short, since_when, standard_error
 from metrpo.seeing.runs import column
@@ -98,7 +99,7 @@ def no_improvement(rows: Sequence[Row], config: Config) -> Concern | None:
         "no-improvement",
         "warning",
         int(iteration_at(rows, 0)),
-        f"No return above the first one, {short(real[0])}, in {len(real)} iterations",
+        f"No return above the first one, {short(real[0])}, in {counted(len(real), 'iteration')}",
         "the task was solved at once, or nothing is learnt",
         "look at the video; if it fails, more exploration (collect.max_std), more real steps an iteration "
         "(collect.steps), or a reward that says more",
@@ -209,7 +210,7 @@ def nothing_accepted(rows: Sequence[Row], config: Config) -> Concern | None:
     nothing = column(rows, "accepted_updates") == 0
     since = since_when(rows, nothing)
     if since is not None and (count := int(iteration_at(rows, -1)) - since + 1) >= NEVER_ACCEPTED:
-        measured = f"No policy update accepted in {count} iterations"
+        measured = f"No policy update accepted in {counted(count, 'iteration')}"
     elif len(nothing) >= LAST and (count := int(nothing[-LAST:].sum())) >= FEW:
         since, measured = int(iteration_at(rows, -LAST)), f"No policy update accepted in {count} of {LAST} iterations"
     else:
@@ -238,7 +239,7 @@ def never_stopped(rows: Sequence[Row], config: Config) -> Concern | None:
         "validation-never-stops",
         "warning" if config.ensemble.members == 1 else "note",
         since,
-        f"All {config.validate.max_updates} policy updates made in each of {count} iterations",
+        f"All {counted(config.validate.max_updates, 'policy update')} made in each of {counted(count, 'iteration')}",
         f"{judge} never stop{'s' if config.ensemble.members == 1 else ''} the policy",
         f"{members}; an imagined return far above the real one says that the stop is needed",
     )

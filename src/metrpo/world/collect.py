@@ -13,6 +13,7 @@ import gymnasium
 import numpy as np
 
 from metrpo.config import CollectConfig
+from metrpo.counting import counted
 from metrpo.errors import DivergedError, EpisodeError, NotFiniteError, TaskError, UnplayableError
 from metrpo.types import Episode
 from metrpo.world import returned
@@ -176,8 +177,8 @@ def action_of(task: Task, given: np.ndarray, where: str) -> np.ndarray:
     if array is None or array.size != task.action_size or array.ndim > 1:
         got = f"{given!r}" if array is None else f"shape {list(array.shape)}"
         raise TaskError(
-            f"{task.name}: {where}: expected an action of {task.action_size} numbers, got {got}; use a policy that was "
-            "made for this task"
+            f"{task.name}: {where}: expected an action of {counted(task.action_size, 'number')}, got {got}; use a "
+            "policy that was made for this task"
         )
     action = np.clip(array, -1.0, 1.0).astype(np.float32).reshape(task.action_size)
     if np.isnan(action).any():
@@ -210,7 +211,7 @@ def _numbers(task: Task, where: str, observation: Any, reward: float) -> np.ndar
     if state is None or state.shape != (task.state_size,):
         got = observation if state is None else f"shape {list(state.shape)}"
         advice = "return an array of so many numbers, or make the task by metrpo.task_of, which flattens others"
-        expected = f"an observation of {task.state_size} numbers"
+        expected = f"an observation of {counted(task.state_size, 'number')}"
         raise returned.broken(task.name, where, expected, got, advice, EpisodeError)
     for what, value in (("observation", state), ("reward", reward)):
         if not representable(value):

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from numpy.typing import NDArray
 
+from metrpo.counting import counted
 from metrpo.errors import NotFiniteError, TaskError
 from metrpo.world import returned
 from metrpo.world.limits import require_size
@@ -90,7 +91,7 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         """The action in the environment's own range and type, never beyond its bounds."""
         wanted = np.asarray(action, np.float64)
         if wanted.shape != (self.action_size,):
-            expected, got = f"an action of {self.action_size} numbers", f"shape {list(wanted.shape)}"
+            expected, got = f"an action of {counted(self.action_size, 'number')}", f"shape {list(wanted.shape)}"
             raise broken(self._name, "step()", expected, got, "use a policy that was made for this task")
         part = 0.5 * (np.clip(wanted, -1, 1) + 1).reshape(self._actions.shape)
         scaled = (self._low + part * (self._high - self._low)).astype(self._actions.dtype)
@@ -171,7 +172,7 @@ Path = tuple[Any, ...]
 
 def parts(space: Any, path: Path = ()) -> Iterator[tuple[Path, Any]]:
     """The parts of Dicts and Tuples, in the order in which they are flattened, with the way to each; else the space."""
-    inner = getattr(space, "spaces", None)
+    inner: Any = getattr(space, "spaces", None)
     if not isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple):
         yield path, space
         return

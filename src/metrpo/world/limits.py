@@ -19,8 +19,9 @@ def require_size(name: str, size: int, most: str = "") -> None:
     if size > MOST_NUMBERS:
         kept = CollectConfig.max_train + CollectConfig.max_validation
         raise TaskError(
-            f"{name}: expected observations of at most {MOST_NUMBERS:,} numbers, got {size:,}{most and f', {most}'}: a full dataset of "
-            f"{kept:,} transitions would take {kept * size * 8 / 2**30:,.0f} GiB; pictures cannot be learned here: "
+            f"{name}: expected observations of at most {MOST_NUMBERS:,} numbers, got {size:,}{most and f', {most}'}: a "
+            f"full dataset of {kept:,} transitions would take {kept * size * 8 / 2**30:,.0f} GiB; pictures cannot be "
+            "learned here: "
             "give positions and velocities instead, or features that a network of yours makes of the picture (a "
             "gymnasium.ObservationWrapper)"
         )

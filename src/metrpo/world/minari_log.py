@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from gymnasium.spaces import Box, flatten
 
+from metrpo.counting import counted
 from metrpo.errors import TaskError
 from metrpo.types import Episode
 from metrpo.world.task import Task
@@ -43,7 +44,9 @@ def load(name: str, task: Task) -> list[Episode]:
         ("actions", task.action_size, episodes[0].actions),
     ):
         if rows.shape[1] != expected:
-            raise TaskError(f"{name}: {what}: expected {expected} numbers for {task.name}, got {rows.shape[1]}")
+            raise TaskError(
+                f"{name}: {what}: expected {counted(expected, 'number')} for {task.name}, got {rows.shape[1]}"
+            )
     for number, episode in enumerate(episodes):
         if not all(np.isfinite(rows).all() for rows in episode[:3]):
             raise TaskError(f"{name}: episode {number}: expected finite numbers, got some that are not")

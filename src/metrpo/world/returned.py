@@ -63,7 +63,8 @@ def broken(
     name: str, call: str, expected: str, got: object, advice: str, kind: type[TaskError] = TaskError
 ) -> TaskError:
     """The error of an environment that breaks its promise."""
-    return kind(f"{name}: {call}: expected {expected}, got {_cut(got, 400) if isinstance(got, str) else shown(got)}; {advice}")
+    gave = _cut(got, 400) if isinstance(got, str) else shown(got)
+    return kind(f"{name}: {call}: expected {expected}, got {gave}; {advice}")
 
 
 @contextmanager
