@@ -23,7 +23,7 @@ from metrpo.default_dir import default_run_dir
 from metrpo.experiments.figures import Run
 from metrpo.options import COMMANDS, parse
 from metrpo.presets import preset
-from metrpo.run import directory, doctor, machine
+from metrpo.run import directory, doctor, machine, video
 from metrpo.run.directory import RunDirectory
 from metrpo.run.policy_file import load_policy
 from metrpo.run.video import VideoError
@@ -270,6 +270,32 @@ def test_evaluating_a_function_needs_a_task():
     assert metrpo.evaluate(lambda state: np.zeros(2), "swimmer", episodes=1).task == "Swimmer"
 
 
+@pytest.mark.parametrize("command", ["evaluate", "render", "export", "improve", "train"])
+def test_a_file_in_place_of_a_run_directory_is_called_one(capsys, tmp_path, command):
+    (tmp_path / "mine.py").write_text("")
+    before = contents(tmp_path)
+    assert run(*(["train", "Swimmer", "--run-dir"] if command == "train" else [command]), "mine.py") == 2
+    said = capsys.readouterr().err
+    assert said.startswith("metrpo: mine.py is a file; ")
+    assert "expected a run directory" in said or "--run-dir expects a directory" in said
+    assert contents(tmp_path) == before
+
+
+@pytest.mark.parametrize(
+    ("command", "file"),
+    [("render", "video.mp4"), ("export", "policy.py"), ("report", "page.html"), ("plot", "curves.svg")],
+)
+def test_every_file_that_is_asked_for_may_lie_in_a_new_folder(capsys, monkeypatch, command, file):
+    assert run("train", "Swimmer", "--iterations", "1", "--run-dir", "a", "--no-video") == 0
+    frames = ([np.zeros((16, 16, 3), np.uint8)] * 2, 20)
+    monkeypatch.setattr("metrpo.evaluation.record", video.record)
+    monkeypatch.setattr(video, "_episode", lambda *_: frames)
+    assert run(command, "a", "--out", f"new/folder/{file}") == 0
+    assert Path("new/folder", file).exists()
+    assert run(command, "--help") == 0
+    assert "missing folders are made" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+
+
 def test_render_names_its_file(capsys):
     run("train", "Swimmer", "--iterations", "1", "--run-dir", "a")
     capsys.readouterr()
@@ -494,8 +520,8 @@ def program(*arguments: str, **environment: str | None) -> subprocess.CompletedP
 def test_a_gpu_that_is_not_there_is_one_message(platforms):
     ran = program("train", "Swimmer", "--device", "gpu", "--run-dir", "a", JAX_PLATFORMS=platforms)
     assert ran.returncode == 2
-    assert "metrpo: device: expected a GPU that JAX can use, got " in ran.stderr
-    assert "cpu: cpu; install JAX for it (pip install 'jax[cuda13]', or 'jax[cuda12]'" in ran.stderr
+    assert "metrpo: device: JAX finds no GPU here, only the CPU; install JAX for it (pip install " in ran.stderr
+    assert "(pip install 'jax[cuda13]', or 'jax[cuda12]'" in ran.stderr
     assert ran.stderr.count("\n") == 1
     assert not Path("a").exists()
 

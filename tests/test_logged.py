@@ -83,7 +83,8 @@ def test_what_does_not_fit_is_refused(tmp_path, changes, message):
 def test_a_file_that_is_no_archive_is_refused(tmp_path, content):
     if content is not None:
         (tmp_path / "log.npz").write_bytes(content)
-    with pytest.raises(TaskError, match="cannot be read"):
+    expected = "there is no such file; expected an .npz of states, actions, " if content is None else "cannot be read"
+    with pytest.raises(TaskError, match=expected):
         logged.load(tmp_path / "log.npz", probe.PROBE)
 
 

@@ -124,7 +124,9 @@ def test_a_dataset_that_nobody_has_is_one_message(monkeypatch):
         raise FileNotFoundError("no such dataset")
 
     monkeypatch.setattr(minari, "load_dataset", none)
-    with pytest.raises(TaskError, match=r"minari:no/such-v0: expected a Minari dataset.*minari list remote"):
+    with pytest.raises(
+        TaskError, match=r"minari:no/such-v0: expected a data set's full name, such as .*minari list remote"
+    ):
         logged.load("minari:no/such-v0", get_task("Swimmer"))
 
 

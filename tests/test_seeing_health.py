@@ -93,7 +93,7 @@ CASES = [
         8,
         "Validation loss 20",
     ),
-    ("not-finite", changed(12, return_imagined=NAN), CONFIG, 12, "No finite number in return_imagined"),
+    ("not-finite", changed(12, return_imagined=NAN), CONFIG, 12, "return_imagined is not a finite number"),
     ("not-evaluated", changed(10, return_real=NAN, gap=NAN), CONFIG, 10, "No real return"),
     ("failed-episodes", changed(3, failed_episodes=2), CONFIG, 3, "20 real episodes left out"),
     ("std-collapsed", changed(4, mean_std=0.05), CONFIG, 4, "Standard deviation of the policy 0.05, at first 1"),

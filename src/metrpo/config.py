@@ -265,7 +265,7 @@ class SVGConfig:
     model_steps: int = 200
     """Minibatches after every episode, from all data so far."""
     value_steps: int = 50
-    """SVG(1): gradient steps of the value network after every episode, on its own returns."""
+    """SVG(1): gradient steps of the value network after every episode, on that episode's returns."""
     value_learning_rate: float = 1e-3
     """SVG(1): Adam's step size for the value network."""
 

@@ -158,7 +158,7 @@ class Render:
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """The run directory."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
-    """File to write, .mp4 or .gif; default: video.mp4 in the run directory."""
+    """File to write, .mp4 or .gif; default: video.mp4 in the run directory; missing folders are made."""
     seed: int = 0
     """Decides the start state."""
     task: Annotated[str | None, arg(metavar="TASK")] = None
@@ -178,7 +178,7 @@ class Export:
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """The run directory."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
-    """File to write, .py, .onnx or .npz; default: policy.py in the run directory."""
+    """File to write, .py, .onnx or .npz; default: policy.py in the run directory; missing folders are made."""
 
 
 @dataclass(frozen=True)
@@ -389,7 +389,7 @@ class Report:
     dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
     """Run directories, or folders with runs inside."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("report.html")
-    """File to write."""
+    """File to write; missing folders are made."""
     json: Switch = False
     """Print what the page says as JSON, besides writing it."""
 
@@ -410,7 +410,7 @@ class Plot:
     dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
     """Run directories, or folders with runs inside."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("curves.png")
-    """File to write, .png, .svg or .pdf."""
+    """File to write, .png, .svg or .pdf; missing folders are made."""
     x: Literal["real_steps", "wall_seconds", "iteration"] = "real_steps"
     """What the curves are drawn against."""
     y: Annotated[str, arg(metavar="COLUMN")] = "return_real"

@@ -64,6 +64,8 @@ def wait_until_free(path: Path, seconds: float) -> None:
 
 
 def _create(path: Path) -> None:
+    if path.is_file():
+        raise RunDirectoryError(f"{path} is a file; --run-dir expects a directory")
     try:
         make_directory(path)
         foreign = [p.name for p in path.iterdir() if p.name != ".lock" and ".tmp" not in p.name]

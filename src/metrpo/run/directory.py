@@ -316,6 +316,8 @@ def stored_config(run_dir: str | Path) -> Config:
     Raises `RunDirectoryError` when it holds none, or what it holds cannot be read.
     """
     file = Path(run_dir) / "config.json"
+    if Path(run_dir).is_file():
+        raise RunDirectoryError(f"{run_dir} is a file; expected a run directory")
     try:
         if not file.exists():
             if run := inside(Path(run_dir), file.name):

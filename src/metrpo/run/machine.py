@@ -127,15 +127,16 @@ def memory() -> int:
 def _require_device(device: Literal["cpu", "gpu"] | None) -> None:
     """Raises `MetrpoError` unless JAX finds what was asked for: by itself it takes the CPU in silence."""
     try:
-        found = device_names()
+        names = device_names()
     except MetrpoError as error:
         raise MetrpoError(f"{error}; unset JAX_PLATFORMS, or install the GPU's JAX: {INSTALL_GPU}") from None
     import jax
 
     if device == "gpu" and jax.devices()[0].platform != "gpu":
+        cpu = all(name.startswith("cpu") for name in names)
+        found = "only the CPU" if cpu else f"only {', '.join(names)}"
         raise MetrpoError(
-            f"device: expected a GPU that JAX can use, got {', '.join(found)}; install JAX for it "
-            f"({INSTALL_GPU}), or use --device cpu"
+            f"device: JAX finds no GPU here, {found}; install JAX for it ({INSTALL_GPU}), or use --device cpu"
         )
 
 

@@ -176,6 +176,8 @@ def load_policy(directory: str | Path) -> LoadedPolicy:
     its sizes say, or weights that are not finite.
     """
     path = Path(directory)
+    if path.suffix != ".npz" and path.is_file():
+        raise RunDirectoryError(f"{path} is a file; expected a run directory, or a policy.npz")
     path = path if path.suffix == ".npz" else path / FILE
     if not path.exists():
         raise RunDirectoryError(f"{directory} holds no policy: {_where_else(path)}")

@@ -139,9 +139,9 @@ def not_finite(rows: Sequence[Row], config: Config) -> Concern | None:
         "not-finite",
         "warning",
         since,
-        f"No finite number in {', '.join(bad[-1][:3])}",
+        f"{', '.join(bad[-1][:3])} {'is not a finite number' if len(bad[-1]) == 1 else 'are not finite numbers'}",
         "a model or the policy has left all bounds",
-        "a smaller fit.learning_rate, rewards and observations of about one, then go on from an earlier run",
+        "try a smaller fit.learning_rate, or rescale rewards and observations to about 1",
     )
 
 

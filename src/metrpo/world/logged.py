@@ -29,7 +29,7 @@ def load(path: str | Path, task: Task) -> list[Episode]:
     if str(path).startswith(minari_log.PREFIX):
         return minari_log.load(str(path), task)
     if not Path(path).exists():
-        raise TaskError(f"{path}: expected an .npz of numbers, got a file that cannot be read (there is none)")
+        raise TaskError(f"{path}: there is no such file; expected an .npz of {', '.join(ARRAYS)}")
     with opened(Path(path), TaskError) as file:
         found = arrays_of(file, Path(path), TaskError, compressed=True, only=ARRAYS)
     if missing := [name for name in ARRAYS if name not in found]:

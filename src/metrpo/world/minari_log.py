@@ -31,7 +31,8 @@ def load(name: str, task: Task) -> list[Episode]:
         found = list(dataset.iterate_episodes())
     except Exception as error:
         raise TaskError(
-            f"{name}: expected a Minari dataset, got none ({type(error).__name__}: {error}); see: minari list remote"
+            f"{name}: expected a data set's full name, such as minari:D4RL/door/human-v2; see: minari list remote "
+            f"({type(error).__name__}: {error})"
         ) from error
     bounds = dataset.action_space
     if not (isinstance(bounds, Box) and np.isfinite(bounds.low).all() and np.isfinite(bounds.high).all()):
