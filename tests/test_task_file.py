@@ -244,6 +244,23 @@ def raising():
     raise TaskError("far enough")
 
 
+def test_init_names_only_what_can_add_episodes_to_its_task(monkeypatch, capsys):
+    write(
+        "arm.py",
+        """
+        import dataclasses
+        import metrpo
+        task = dataclasses.replace(metrpo.tasks()["Swimmer"], name="arm", env_id=None)
+    """,
+    )
+    monkeypatch.setattr("metrpo.stepwise.begin", lambda *_: None)
+    assert cli.main(["init", "arm.py:task", "--run-dir", "my arm"]) == 0
+    said = "add episodes (metrpo.append_episode, or metrpo collect 'my arm' --data FILE), then"
+    assert said in capsys.readouterr().out
+    assert cli.main(["init", "Swimmer", "--run-dir", "swim"]) == 0
+    assert "add episodes (metrpo collect swim), then" in capsys.readouterr().out
+
+
 def test_only_what_lies_in_a_file_or_module_can_have_moved():
     with pytest.raises(ConfigError, match="task: expected it for a run whose task lies in a file or module, got"):
         moved("Swimmer", "there/mine.py:make")

@@ -141,11 +141,14 @@ def _run(command: Run) -> tuple[Config, Path]:
 def _init(command: Init) -> int:
     from metrpo.run.policy_file import FILE
     from metrpo.stepwise import begin
+    from metrpo.world.registry import get_task
 
     config, run_dir = _run(command)
     begin(config, run_dir)
-    print(f"{run_dir / FILE} is the untrained policy; add episodes (metrpo collect {run_dir}), then")
-    print(f"metrpo improve {run_dir}")
+    collect = f"metrpo collect {shlex.quote(str(run_dir))}"
+    how = collect if get_task(config.task).playable else f"metrpo.append_episode, or {collect} --data FILE"
+    print(f"{run_dir / FILE} is the untrained policy; add episodes ({how}), then")
+    print(f"metrpo improve {shlex.quote(str(run_dir))}")
     return 0
 
 

@@ -28,7 +28,6 @@ import numpy as np
 
 from metrpo import config as configs
 from metrpo.config import Config
-from metrpo.counting import counted
 from metrpo.errors import ConfigError, RunDirectoryError, TaskError
 from metrpo.run import yardsticks
 from metrpo.run.checkpoint import load_state, save_state
@@ -202,7 +201,7 @@ class RunDirectory:
         if metrics.exists():
             finished = len(read_metrics(metrics))
             raise RunDirectoryError(
-                f"{self.path} has lost its checkpoints: expected one for the {counted(finished, 'iteration')} in "
+                f"{self.path} has lost its checkpoints: expected that of iteration {finished}, the last in "
                 f"{metrics.name}, got none; put the files back or choose another directory"
             )
 
