@@ -133,7 +133,41 @@ def test_train_is_init_and_steps(tiny):
 
 def test_a_budget_of_real_steps_is_spent_and_no_more():
     state = training.train(override(TINY, {"real_steps": 41}))
-    assert (state.iteration, state.real_steps) == (2, 80)
+    assert (state.iteration, state.real_steps) == (2, 41)
+
+
+@pytest.mark.parametrize("ends", ["Probe", "EndingProbe"])
+def test_collection_stops_at_a_budget_below_what_an_iteration_collects(tiny, ends):
+    config = override(TINY, {"task": ends, "real_steps": 33, "collect.steps": 500})
+    episodes = algorithm.collect(config, tiny.states[0])
+    assert sum(len(e.rewards) for e in episodes) == 33
+    whole = algorithm.collect(override(config, {"real_steps": None}), tiny.states[0])
+    for cut, e in zip(episodes, whole, strict=False):
+        np.testing.assert_array_equal(cut.states, e.states[: len(cut.states)])
+    assert not episodes[-1].terminated, "the budget is no end of the task"
+    first = whole[:1]
+    log = types.SimpleNamespace(pending=lambda: list(first), append=lambda e: None, failures=dict)
+    resumed = algorithm.collect(config, tiny.states[0], log=log)
+    assert sum(len(e.rewards) for e in resumed) == 33, "steps that wait count"
+
+
+def test_episodes_of_the_record_have_a_bound(tiny, monkeypatch):
+    monkeypatch.setattr(algorithm, "RECORDED", 7)
+    asked = []
+    monkeypatch.setattr(probe.ProbeEnv, "step", counted(probe.ProbeEnv.step, asked))
+    returns = algorithm.evaluate(TINY, probe.LONG_PROBE, tiny.states[0].policy, 1)
+    assert len(returns) == 2
+    assert len(asked) == 2 * 7
+    _, row = algorithm.step(TINY, tiny.states[0])
+    assert np.isnan(row["gap"]), "imagined episodes are longer than evaluated ones"
+
+
+def counted(step, calls):
+    def also_counted(self, action):
+        calls.append(1)
+        return step(self, action)
+
+    return also_counted
 
 
 @pytest.mark.parametrize(
@@ -190,7 +224,7 @@ def test_rows_say_what_happened(tiny):
 def test_the_reported_return_is_the_accepted_policys_without_noise(tiny, monkeypatch):
     seen = {}
 
-    def evaluate(task, act, episodes, seed, at_most):
+    def evaluate(task, act, episodes, seed, at_most, longest):
         seen.update(act=act, episodes=episodes, seed=seed)
         return np.array([1.0, 4.0])
 

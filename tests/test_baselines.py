@@ -116,6 +116,13 @@ def test_a_baseline_repeats_and_resumes_itself(tmp_path, config, task):
     assert not np.allclose(whole.policy.layers[0][0], other.policy.layers[0][0])
 
 
+@pytest.mark.parametrize("config", [TRPO, SVG], ids=["trpo", "svg"])
+def test_a_baseline_stops_at_its_budget_of_real_steps(config):
+    config = override(config, {"task": "EndingProbe", "real_steps": 33, "collect.steps": 500, "evaluation_episodes": 1})
+    state = training.train(config)
+    assert (state.iteration, state.real_steps) == (1, 33)
+
+
 # ---------------------------------------------------------------- SVG
 
 

@@ -112,6 +112,17 @@ def test_the_seed_decides_everything():
         assert len({e.states[0].tobytes() for e in one}) == len(one), "every episode has a start of its own"
 
 
+@pytest.mark.parametrize("at_most", [1, 20, 25, 150])
+def test_no_step_is_played_beyond_the_most(at_most):
+    for task in (probe.PROBE, probe.ENDING_PROBE):
+        draw = lambda rng: real.explore(ZERO, CollectConfig(max_std=3.0), rng)  # noqa: E731
+        capped = real.collect(task, draw, at_most, np.random.default_rng(0), at_most=at_most)
+        whole = real.collect(task, draw, at_most, np.random.default_rng(0))
+        assert sum(len(e.rewards) for e in capped) == at_most
+        for a, b in zip(capped, whole, strict=True):
+            np.testing.assert_array_equal(a.states, b.states[: len(a.states)])
+
+
 def test_progress_is_told_the_steps_so_far():
     told = []
     real.collect(probe.PROBE, lambda rng: ZERO, 50, np.random.default_rng(0), told.append)

@@ -172,6 +172,17 @@ def test_what_needs_an_environment_is_refused_without_one(tmp_path, setting):
         stepwise.begin(config("Elsewhere", **setting), tmp_path)
 
 
+def test_what_the_budget_leaves_is_collected_and_more_only_when_asked_for(tmp_path):
+    stepwise.begin(dataclasses.replace(config(), real_steps=33), tmp_path)
+    waiting = stepwise.collect(tmp_path)
+    assert sum(len(e.rewards) for e in waiting) == 33
+    assert len(stepwise.collect(tmp_path)) == len(waiting)
+    assert sum(len(e.rewards) for e in stepwise.collect(tmp_path, at_least=50)) >= 50
+    stepwise.improve(tmp_path)
+    with pytest.raises(ConfigError, match=r"budget of .*, 33, is spent; .* metrpo collect .* --steps \d+"):
+        stepwise.collect(tmp_path)
+
+
 def test_a_run_is_begun_once(tmp_path):
     stepwise.begin(config(), tmp_path)
     with pytest.raises(RunDirectoryError, match="holds a run already"):

@@ -136,6 +136,17 @@ def test_steps_are_told_and_the_evaluation_has_its_bound():
     np.testing.assert_array_equal(
         together.evaluate(task, act, 9, 4, at_most=350), collect.evaluate(task, act, 9, 4, at_most=350)
     )
+    short = together.evaluate(task, act, 3, 4, longest=5)
+    np.testing.assert_array_equal(short, collect.evaluate(task, act, 3, 4, longest=5))
+    assert not np.array_equal(short, together.evaluate(task, act, 3, 4))
+
+
+@pytest.mark.parametrize("at_most", [1, 90, 400])
+def test_no_step_is_played_beyond_the_most(at_most):
+    task, policy = get_task("Ant"), random_policy(0, 29, 8, std=3.0)
+    drawn = on_policy.collect(task, policy, 450, np.random.default_rng(0), at_most=at_most)
+    assert sum(len(e.rewards) for e in drawn.episodes) == at_most
+    assert [len(a) for a in drawn.actions] == [len(e.rewards) for e in drawn.episodes]
 
 
 def test_what_is_not_a_number_is_named():

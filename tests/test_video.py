@@ -53,6 +53,14 @@ def zero(observation):
     return np.zeros(2, np.float32)
 
 
+def test_a_video_of_an_endless_episode_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr(video, "FRAMES", 3)
+    env = Pictures("rgb_array")
+    env.seen = [zero(None)] * 10  # past the step at which it ends
+    frames, _ = video._episode(lambda render_mode: env, zero, 0)
+    assert len(frames) == 4
+
+
 @needs_encoder
 def test_mp4_holds_every_frame_in_h264(tmp_path):
     import imageio_ffmpeg

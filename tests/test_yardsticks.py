@@ -12,6 +12,7 @@ from metrpo.errors import TaskError
 from metrpo.run import yardsticks
 from metrpo.run.directory import RunDirectory
 from metrpo.run.progress import Progress
+from metrpo.world import registry
 from metrpo.world import yardsticks as world
 from tiny_run import CONFIG
 
@@ -40,9 +41,17 @@ def test_doing_nothing_earns_what_a_loop_says():
 @pytest.mark.parametrize(("horizon", "episodes"), [(20, 10), (1000, 10), (4000, 2), (50_000, 1)])
 def test_long_episodes_are_played_less_often(monkeypatch, horizon, episodes):
     seen = []
-    monkeypatch.setattr(world.collect, "evaluate", lambda task, act, n, seed: seen.append(n) or np.zeros(n))
+    monkeypatch.setattr(
+        world.collect, "evaluate", lambda t, act, n, seed, longest: seen.append((n, longest)) or np.zeros(n)
+    )
     world.measure(dataclasses.replace(probe.PROBE, horizon=horizon))
-    assert seen == [episodes, episodes]
+    assert seen == 2 * [(episodes, 10_000)]
+
+
+def test_a_run_says_what_evaluation_cuts(monkeypatch, caplog):
+    monkeypatch.setitem(registry._TASKS, "Probe", dataclasses.replace(probe.PROBE, horizon=10_001))
+    training.check(CONFIG)
+    assert "Probe: episodes of up to 10,001 steps: evaluation cuts them after 10,000" in caplog.text
 
 
 class Heard(Progress):

@@ -26,7 +26,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import jax
 import numpy as np
 
-from metrpo import phase, scales
+from metrpo import budget, phase, scales
 from metrpo.config import Config
 from metrpo.errors import ConfigError, DivergedError, EpisodeError, MetrpoError, NotFiniteError
 from metrpo.finite import naming, require_finite
@@ -48,6 +48,7 @@ from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
 from metrpo.world import logged, together
 from metrpo.world.dataset import Dataset
+from metrpo.world.limits import RECORDED
 from metrpo.world.origin import relative, shifted
 from metrpo.world.registry import get_task, without_formulas
 from metrpo.world.task import Task
@@ -165,14 +166,16 @@ def collect(
 ) -> list[Episode]:
     """The real episodes of the next iteration: those that wait in `log`, and more until they have enough steps.
 
-    Enough are `at_least`, or as many as the config asks for; an episode of more steps than the config asks for is cut
-    there. New ones go to `log` as they end; what a run that was stopped has collected is not collected again.
+    Enough are `at_least`, or as many as the config asks for and its budget allows; an episode of more steps than the
+    config asks for is cut there, and so is the one that reaches the end of the budget. New ones go to `log` as they
+    end; what a run that was stopped has collected is not collected again.
 
     An episode in which the environment gives NaN or infinity is left out for good: its seed would give the same again.
     So is one that fails otherwise, but in its second try: the first ends the run. Raises `UnplayableError` when too
     many are left out, `EpisodeError` for another failure.
     """
-    enough = (0 if config.real_steps == 0 else config.collect.steps) if at_least is None else at_least
+    enough = budget.steps_wanted(config, state.real_steps) if at_least is None else at_least
+    at_most = budget.steps_left(config, state.real_steps) if at_least is None else math.inf
     progress.stage("collect", enough)
     log = log or Unkept()
     episodes = log.pending()
@@ -180,16 +183,23 @@ def collect(
         number = len(episodes) + left_out(log)
         try:
             with naming("collect", state.iteration + 1):
-                _play(config, state, number, episodes, enough, log, progress)
+                _play(config, state, number, episodes, (enough, at_most), log, progress)
         except EpisodeError as error:
             _note_failure(log, len(episodes) + left_out(log), error)
     return episodes
 
 
 def _play(
-    config: Config, state: State, first: int, episodes: list[Episode], enough: int, log: Log, progress: Progress
+    config: Config,
+    state: State,
+    first: int,
+    episodes: list[Episode],
+    bounds: tuple[int, float],
+    log: Log,
+    progress: Progress,
 ) -> None:
-    """Adds episodes number `first` and following to `episodes` until these have `enough` steps."""
+    """Adds episodes from number `first` on to `episodes` until their steps are within `bounds`, least and most."""
+    enough, at_most = bounds
     inputs = _inputs(config, task_for(config), state.dataset)
     mean = partial(
         _perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise, inputs=inputs
@@ -198,7 +208,7 @@ def _play(
     # Each episode has randomness of its own, so that it is the same one after any interruption.
     rngs = (rng_of(config.seed, state.iteration + 1, Stage.COLLECT, number) for number in itertools.count(first))
     steps, longest = sum(len(e.rewards) for e in episodes), config.collect.steps
-    with closing(real.play(task_for(config), explorer, rngs, longest, progress.played)) as played:
+    with closing(real.play(task_for(config), explorer, rngs, longest, progress.played, at_most - steps)) as played:
         while steps < enough:
             episodes.append(next(played))
             log.append(episodes[-1])
@@ -266,7 +276,9 @@ def learn(
         returns = recorded_returns(config, task, policy, iteration, origin=dataset.origin)
         trust = _end_calibration(task, dataset, ensemble, iteration)
     collected = float(np.mean([e.rewards.sum() for e in episodes])) if episodes else math.nan
-    row = _row(config, following, returns, collected, fitted, improved, phase.is_cut(config, task))
+    row = _row(
+        config, following, returns, collected, fitted, improved, phase.is_cut(config, task) or task.horizon > RECORDED
+    )
     row |= {"failed_episodes": failed}
     row |= diagnosis.row() | {f"improved_{k}": float(share) for k, share in enumerate(improved.improved)}
     return following, row | trust | clock.row()
@@ -436,14 +448,15 @@ def evaluate(
 
     The policy sees states less `origin` [S].
 
-    Fewer where they have `EVALUATION_STEPS` together. One NaN for a task that only another program can play.
+    Fewer where they have `EVALUATION_STEPS` together; each is cut after `RECORDED` steps. One NaN for a task that only
+    another program can play.
     """
     if not task.playable:
         return np.array([math.nan])
     seed = int(rng_of(config.seed, iteration, stage).integers(2**31))
     act: real.Act = partial(gaussian.mean, _host(policy))
     act = act if origin is None else _of_real(act, origin)
-    return together.evaluate(task, act, config.evaluation_episodes, seed, EVALUATION_STEPS)
+    return together.evaluate(task, act, config.evaluation_episodes, seed, EVALUATION_STEPS, RECORDED)
 
 
 def _of_real(act: real.Act, origin: np.ndarray) -> real.Act:
@@ -486,7 +499,7 @@ def _row(
         "return_real_std": float(np.std(returns)),
         "return_collected": collected,
         "return_imagined": imagined,
-        # What shorter episodes earn cannot be compared.
+        # What episodes of different lengths earn cannot be compared.
         "gap": math.nan if cut else imagined - float(np.mean(returns)),
         **{f"validation_loss_{k}": float(loss) for k, loss in enumerate(losses)},
         "train_loss": float(np.mean(fitted.train_loss)),

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from metrpo import algorithm
+from metrpo import algorithm, budget
 from metrpo.algorithm import State
 from metrpo.config import Config
 from metrpo.errors import ConfigError, RunDirectoryError
@@ -54,10 +54,11 @@ def collect(
     """Adds real episodes to those that wait, and returns all that do.
 
     Plays the environment with exploration until the waiting episodes have `at_least` steps (default: the config's
-    `collect.steps`), or reads a log (see `world.logged`) and adds what does not wait yet. `task` says where the run's
-    task is, if its file has moved.
+    `collect.steps`, within its budget of real steps), or reads a log (see `world.logged`) and adds what does not wait
+    yet. `task` says where the run's task is, if its file has moved.
 
-    Raises `RunDirectoryError` when `run_dir` holds no run, `TaskError` when the task has no environment to play.
+    Raises `RunDirectoryError` when `run_dir` holds no run, `TaskError` when the task has no environment to play,
+    `ConfigError` when the budget is spent and `at_least` does not ask for more.
     """
     config = stored_config(run_dir)
     _settle(run_dir, config.task, task)
@@ -72,10 +73,14 @@ def collect(
                     run.episodes.append(episode)
             return run.episodes.pending()
         algorithm.task_for(config).require_playable()
-        wanted = config.collect.steps if at_least is None else at_least
+        if at_least is None and budget.steps_left(config, state.real_steps) == 0:
+            raise ConfigError(
+                f"real_steps: the budget of {run_dir}, {config.real_steps:,}, is spent; to play more all the same: "
+                f"metrpo collect {run_dir} --steps {config.collect.steps}"
+            )
         progress.begin(state.iteration + 1, None)
         try:
-            return algorithm.collect(config, state, progress, run.episodes, wanted)
+            return algorithm.collect(config, state, progress, run.episodes, at_least)
         finally:
             progress.close()
 

@@ -7,7 +7,6 @@ functions, init(config) -> state and step(config, state, progress) -> (state, ro
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable, Mapping
 from importlib import import_module
@@ -16,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from metrpo import budget
 from metrpo.algorithm import Log, Row
 from metrpo.config import Config
 from metrpo.errors import ConfigError, MetrpoError
@@ -28,6 +28,7 @@ from metrpo.run.yardsticks import keep
 from metrpo.seeds import Stage, rng_of
 from metrpo.world.check import check_formulas
 from metrpo.world.known import KNOWN
+from metrpo.world.limits import RECORDED
 from metrpo.world.registry import get_task
 from metrpo.world.yardsticks import measure
 
@@ -94,11 +95,17 @@ def train(config: Config, run_dir: str | Path | None = None, progress: Progress 
 
 
 def check(config: Config) -> None:
-    """Holds the formulas of a task that is not ours against its environment (`metrpo.world.check`).
+    """Holds the formulas of a task that is not ours against its environment (`metrpo.world.check`), before a run.
 
-    Raises `TaskError` where they differ.
+    Says what evaluation will cut. Raises `TaskError` where they differ.
     """
     task = get_task(config.task)
+    if task.playable and task.horizon > RECORDED:
+        _log.warning(
+            "%s: episodes of up to %s steps: evaluation cuts them after %s, and there is no gap between imagined and "
+            "real returns",
+            task.name, f"{task.horizon:,}", f"{RECORDED:,}",
+        )  # fmt: skip
     ours = task.make is None or task.name in KNOWN  # which the tests hold against their environments
     if not (ours or config.trust_reward or config.learn_reward):
         check_formulas(task, rng_of(config.seed, 0, Stage.COLLECT))
@@ -143,15 +150,9 @@ def _loop(
 
 
 def _iterations_left(config: Config, state: Saved) -> int | None:
-    if not config.real_steps:
-        return config.iterations - state.iteration
-    if not state.iteration:
-        return None
-    return math.ceil((config.real_steps - state.real_steps) / (state.real_steps / state.iteration))
+    return budget.iterations_left(config, state.iteration, state.real_steps)
 
 
 def finished(config: Config, state: Saved) -> bool:
     """Whether the budget, iterations or real steps, is spent."""
-    if config.real_steps:
-        return state.real_steps >= config.real_steps
-    return state.iteration >= config.iterations
+    return budget.finished(config, state.iteration, state.real_steps)

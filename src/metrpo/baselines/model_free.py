@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from metrpo import budget
 from metrpo.algorithm import Row, recorded_returns
 from metrpo.baselines import on_policy
 from metrpo.baselines.on_policy import Drawn
@@ -47,12 +48,13 @@ def init(config: Config) -> State:
 
 
 def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
-    """One update of TRPO on `config.collect.steps` real steps."""
+    """One update of TRPO on `config.collect.steps` real steps, or on what is left of the budget."""
     task, iteration, clock = get_task(config.task), state.iteration + 1, Clock()
     with clock("collect"):
-        progress.stage("collect", config.collect.steps)
-        rng = rng_of(config.seed, iteration, Stage.COLLECT)
-        drawn = on_policy.collect(task, state.policy, config.collect.steps, rng, progress.update, config.collect.steps)
+        enough, at_most = budget.steps_wanted(config, state.real_steps), budget.steps_left(config, state.real_steps)
+        progress.stage("collect", enough)
+        rng, longest = rng_of(config.seed, iteration, Stage.COLLECT), config.collect.steps
+        drawn = on_policy.collect(task, state.policy, enough, rng, progress.update, longest, at_most)
     with clock("improve"):
         progress.stage("improve")
         # Other settings, the seed say, must not cause a compilation.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -32,13 +33,15 @@ def collect(
     rng: np.random.Generator,
     on_episode: real.OnEpisode = lambda steps: None,
     longest: int | None = None,
+    at_most: float = math.inf,
 ) -> Drawn:
     """Whole episodes of `at_least` steps together, acting by samples of `policy` (see `world.collect.collect`).
 
     The paper's tasks are played many episodes at a time (`world.together`), each with noise of its own.
+    No step is played beyond `at_most` of all together.
     """
     if together.applies(task):
-        return _together(task, policy, at_least, rng, on_episode, longest)
+        return _together(task, policy, at_least, rng, on_episode, longest, at_most)
     host = jax.tree.map(np.asarray, policy)
     std, drawn, actions = np.exp(host.log_std), list[list[np.ndarray]](), list[np.ndarray]()
 
@@ -56,7 +59,7 @@ def collect(
         drawn.append(actions)
         on_episode(steps)
 
-    episodes = real.collect(task, draw_act, at_least, rng, keep, longest)
+    episodes = real.collect(task, draw_act, at_least, rng, keep, longest, at_most)
     return Drawn(episodes, [np.array(actions, np.float32) for actions in drawn])
 
 
@@ -67,6 +70,7 @@ def _together(
     rng: np.random.Generator,
     on_steps: Callable[[int], None],
     longest: int | None,
+    at_most: float,
 ) -> Drawn:
     host = jax.tree.map(np.asarray, policy)
     std, noise, drawn = np.exp(host.log_std), list[np.ndarray](), list[np.ndarray]()
@@ -84,5 +88,5 @@ def _together(
             drawn[number][step] = actions[i]
         return actions
 
-    episodes = together.play(task, act, seeds(), at_least, longest, on_steps)
+    episodes = together.play(task, act, seeds(), at_least, longest, on_steps, at_most=at_most)
     return Drawn(episodes, [actions[: len(e.rewards)] for actions, e in zip(drawn, episodes, strict=True)])

@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium.spaces import Box
 from gymnasium.wrappers import TransformObservation
 
+from metrpo import budget
 from metrpo.algorithm import Row, recorded_returns
 from metrpo.config import Config
 from metrpo.errors import MetrpoError
@@ -79,13 +80,14 @@ def init(config: Config) -> State:
 
 
 def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
-    """One outer iteration: learning for `collect.steps` real steps, rounded up to whole updates of the algorithm."""
+    """One outer iteration: learning for `collect.steps` real steps, or what is left of the budget, in whole updates."""
     iteration, clock = state.iteration + 1, Clock()
     with closing(_environment(config), config.task) as env, clock("improve"):
-        progress.stage("learn", config.collect.steps)
+        wanted = budget.steps_wanted(config, state.real_steps)
+        progress.stage("learn", wanted)
         model = _model(config, env, _seed(config, iteration, Stage.COLLECT), state)
         watch = _Watch(state.real_steps, clock, progress)
-        model.learn(config.collect.steps, watch, log_interval=None, reset_num_timesteps=False)
+        model.learn(wanted, watch, log_interval=None, reset_num_timesteps=False)
         collected = env.get_episode_rewards()
         state = _state(config, model, iteration)
     with clock("evaluate"):

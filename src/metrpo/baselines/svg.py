@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
+from metrpo import budget
 from metrpo.algorithm import Row, recorded_returns, task_for
 from metrpo.baselines import on_policy
 from metrpo.config import Config
@@ -93,10 +94,11 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
     rng, key = rng_of(config.seed, iteration, Stage.COLLECT), key_of(config.seed, iteration, Stage.IMPROVE)
     collected: list[Episode] = []
     losses, norms, finite = [], [], []
-    progress.stage("learn", config.collect.steps)
-    while (steps := sum(len(e.rewards) for e in collected)) < config.collect.steps:
+    enough, left = budget.steps_wanted(config, state.real_steps), budget.steps_left(config, state.real_steps)
+    progress.stage("learn", enough)
+    while (steps := sum(len(e.rewards) for e in collected)) < enough:
         with clock("collect"):
-            drawn = on_policy.collect(task, state.policy, 1, rng, longest=config.collect.steps)
+            drawn = on_policy.collect(task, state.policy, 1, rng, longest=config.collect.steps, at_most=left - steps)
             collected += drawn.episodes
             state = state._replace(replay=datasets.append(state.replay, drawn.episodes, config.collect.max_train))
             path = _path(drawn.episodes[0].states, drawn.actions[0], drawn.episodes[0].rewards, task.horizon)

@@ -24,13 +24,16 @@ INSTALL_EXTRA = "pip install 'metrpo[video]'"
 _GL = ("mujoco", "OpenGL", "glfw", "pyglet")
 """Packages that draw by OpenGL."""
 
+FRAMES = 2000
+"""Steps of an episode after which its video ends: they are kept in memory, some 700 kB each."""
+
 
 class VideoError(MetrpoError):
     """This machine lacks what a video needs; the message says what to install."""
 
 
 def record(make_env: Callable[..., Any], policy: Callable[[np.ndarray], np.ndarray], path: Path, seed: int = 0) -> Path:
-    """Renders one episode, started with `seed`, to `path` (.mp4, or .gif) and returns it.
+    """Renders one episode, or its first `FRAMES` steps, started with `seed`, to `path` (.mp4, or .gif) and returns it.
 
     `make_env(render_mode="rgb_array")` gives a Gymnasium environment; `policy` maps [S] -> [A].
 
@@ -105,7 +108,7 @@ def _episode(
     with returned.closing(env, "the environment"):
         observation, _ = env.reset(seed=seed)
         frames, over = [_frame(env)], False
-        while not over:
+        while not over and len(frames) <= FRAMES:
             observation, _, terminated, truncated, _ = env.step(policy(observation))
             over = terminated or truncated
             frames.append(_frame(env))

@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from metrpo import budget
 from metrpo.config import Config, difference, from_json
 from metrpo.errors import ConfigError, RunDirectoryError
 from metrpo.run import yardsticks
@@ -127,9 +128,8 @@ def is_finished(run: SeenRun) -> bool:
     """Whether the budget is spent, as far as the metrics say."""
     if not run.rows:
         return False
-    if run.config.real_steps:
-        return int(run.rows[-1]["real_steps"] or 0) >= run.config.real_steps
-    return int(run.rows[-1]["iteration"] or 0) >= run.config.iterations
+    last = run.rows[-1]
+    return budget.finished(run.config, int(last["iteration"] or 0), int(last["real_steps"] or 0))
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
+from metrpo import budget
 from metrpo.run.progress import duration
 from metrpo.seeing.health import examine
 from metrpo.seeing.runs import Found, SeenRun, find, is_finished, told_apart
@@ -244,14 +245,9 @@ def _cells(s: Standing) -> dict[str, tuple[str, str]]:
 
 def _total(run: SeenRun) -> int | None:
     """Iterations when the budget will be spent."""
-    if not run.config.real_steps:
-        return run.config.iterations
-    if not run.rows:
-        return None
-    steps, done = int(run.rows[-1]["real_steps"] or 0), int(run.rows[-1]["iteration"] or 0)
-    if not steps:
-        return None
-    return done + max(0, math.ceil((run.config.real_steps - steps) * done / steps))
+    done, steps = (int(run.rows[-1][name] or 0) if run.rows else 0 for name in ("iteration", "real_steps"))
+    left = budget.iterations_left(run.config, done, steps)
+    return None if left is None else done + left
 
 
 def _seconds(run: SeenRun) -> float | None:

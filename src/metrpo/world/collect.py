@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
@@ -37,11 +38,13 @@ def collect(
     rng: np.random.Generator,
     on_episode: OnEpisode = lambda steps: None,
     longest: int | None = None,
+    at_most: float = math.inf,
 ) -> list[Episode]:
     """Whole episodes of `at_least` steps together; `draw_act(rng)` acts in one episode and brings its own noise.
 
-    An episode of more than `longest` steps is cut there. One in which the environment gives NaN or infinity is left
-    out, with a warning. `on_episode(steps so far)` follows every other.
+    An episode of more than `longest` steps is cut there, and so is the one that reaches `at_most` steps of all
+    together. One in which the environment gives NaN or infinity is left out, with a warning. `on_episode(steps so far)`
+    follows every other.
 
     Raises `UnplayableError` when more than `MOST_FAILURES` are left out, `TaskError` as `play`.
     """
@@ -49,7 +52,7 @@ def collect(
     steps = failed = 0
     while steps < at_least:
         try:
-            with closing(play(task, draw_act, itertools.repeat(rng), longest)) as played:
+            with closing(play(task, draw_act, itertools.repeat(rng), longest, at_most=at_most - steps)) as played:
                 while steps < at_least:
                     episodes.append(next(played))
                     steps += len(episodes[-1].rewards)
@@ -77,29 +80,38 @@ def play(
     rngs: Iterable[np.random.Generator],
     longest: int | None = None,
     on_step: Callable[[], None] = lambda: None,
+    at_most: float = math.inf,
 ) -> Generator[Episode]:
     """One whole episode for each of `rngs`, which decides its start and its noise; `draw_act(rng)` acts in it.
 
-    An episode of more than `longest` steps is cut there, as by the clock. `on_step` is called at every step.
+    An episode of more than `longest` steps is cut there, as by the clock. So is the one that reaches `at_most` steps of
+    all together, and none follows it. `on_step` is called at every step.
 
     Raises `EpisodeError` where the environment fails or breaks its promise (`NotFiniteError` where it gives NaN or
     infinity), `TaskError` where the policy is another task's, `DivergedError` where it gives NaN.
     """
     with returned.closing(task.make_env(), task.name) as env:
         for rng in rngs:
-            yield _episode(task, env, draw_act(rng), seed_of(rng), longest, on_step)
+            longest_now = int(min(task.horizon if longest is None else longest, at_most))
+            episode = _episode(task, env, draw_act(rng), seed_of(rng), longest_now, on_step)
+            at_most -= len(episode.rewards)
+            yield episode
+            if at_most <= 0:
+                return
 
 
-def evaluate(task: Task, act: Act, episodes: int, seed: int, at_most: int | None = None) -> np.ndarray:
+def evaluate(
+    task: Task, act: Act, episodes: int, seed: int, at_most: int | None = None, longest: int | None = None
+) -> np.ndarray:
     """Real, undiscounted returns [episodes] of `act` without any noise, from seeded resets.
 
-    Fewer where the first ones have `at_most` steps together.
+    Fewer where the first ones have `at_most` steps together. Episodes of more than `longest` steps are cut there.
     """
     rng = np.random.default_rng(seed)
     returns, steps = list[float](), 0
     with returned.closing(task.make_env(), task.name) as env:
         while len(returns) < episodes and (at_most is None or steps < at_most):
-            rewards = _episode(task, env, act, seed_of(rng)).rewards
+            rewards = _episode(task, env, act, seed_of(rng), longest).rewards
             returns.append(rewards.sum(dtype=np.float64))
             steps += len(rewards)
     return np.array(returns)

@@ -10,6 +10,9 @@ MOST_NUMBERS = 4000
 LONGEST = 100_000
 """Steps of an episode: every policy update imagines, and every evaluation plays, whole ones."""
 
+RECORDED = 10_000
+"""Steps after which an episode is cut that is played for the record only (evaluation, yardsticks)."""
+
 
 def require_size(name: str, size: int, most: str = "") -> None:
     """Raises `TaskError` for observations of more than `MOST_NUMBERS` numbers, with the room that they would take.

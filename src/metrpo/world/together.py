@@ -94,10 +94,10 @@ def applies(task: Task) -> bool:
 
 
 class _Running:
-    """An episode under way."""
+    """An episode under way, of at most `longest` steps."""
 
-    def __init__(self, number: int, state: np.ndarray) -> None:
-        self.number, self.states = number, [state]
+    def __init__(self, number: int, state: np.ndarray, longest: int) -> None:
+        self.number, self.states, self.longest = number, [state], longest
         self.actions: list[np.ndarray] = []
         self.rewards: list[float] = []
 
@@ -114,12 +114,14 @@ def play(
     longest: int | None = None,
     on_steps: Callable[[int], None] = lambda steps: None,
     threads: int | None = None,
+    at_most: float = math.inf,
 ) -> list[Episode]:
     """Whole episodes from resets by `seeds`, until they have `at_least` steps together or the seeds are used up.
 
     The very episodes that playing one after another would give, in the order of their seeds: another one begins only
-    when those before it cannot have enough steps. An episode of more than `longest` steps is cut there. `on_steps(steps
-    so far)` follows every step; `threads` (by default as many as cores) share the physics.
+    when those before it cannot have enough steps. An episode of more than `longest` steps is cut there, and one that
+    begins where fewer than that remain of `at_most` steps of all together, after those. `on_steps(steps so far)`
+    follows every step; `threads` (by default as many as cores) share the physics.
 
     Raises `EpisodeError` where a simulation diverges, `TaskError` where the policy is another task's, `DivergedError`
     where it gives NaN.
@@ -131,12 +133,15 @@ def play(
     steps = begun = 0
     with closing(SideBySide(task, threads or _cores())) as slots:
         while True:
-            while free and steps + _left(running, horizon) < at_least and (seed := next(seeds, None)) is not None:
+            while free and (taken := steps + _left(running)) < min(at_least, at_most):
+                if (seed := next(seeds, None)) is None:
+                    break
                 slot = free.pop()
-                running[slot], begun = _Running(begun, slots.reset(slot, seed)), begun + 1
+                most = int(min(horizon, at_most - taken))
+                running[slot], begun = _Running(begun, slots.reset(slot, seed), most), begun + 1
             if not running:
                 return [ended[number] for number in range(begun)]
-            for slot, terminated in _advance(task, slots, running, act, horizon):
+            for slot, terminated in _advance(task, slots, running, act):
                 episode = running.pop(slot)
                 ended[episode.number] = episode.finished(terminated)
                 free.append(slot)
@@ -144,14 +149,12 @@ def play(
             on_steps(steps)
 
 
-def _left(running: dict[int, _Running], horizon: int) -> int:
+def _left(running: dict[int, _Running]) -> int:
     """Steps that the episodes under way may still have."""
-    return sum(horizon - len(r.rewards) for r in running.values())
+    return sum(r.longest - len(r.rewards) for r in running.values())
 
 
-def _advance(
-    task: Task, slots: SideBySide, running: dict[int, _Running], act: ActAll, horizon: int
-) -> list[tuple[int, bool]]:
+def _advance(task: Task, slots: SideBySide, running: dict[int, _Running], act: ActAll) -> list[tuple[int, bool]]:
     """One step of every episode under way; those that ended by it, and whether the task ended them."""
     order, now = list(running), list(running.values())
     steps = np.array([len(r.rewards) for r in now])
@@ -165,17 +168,19 @@ def _advance(
         r.states.append(got.states[i])
         r.actions.append(actions[i])
         r.rewards.append(float(got.rewards[i]))
-    over = got.terminated | (steps + 1 >= horizon)
+    over = got.terminated | (steps + 1 >= np.array([r.longest for r in now]))
     return [(slot, bool(got.terminated[i])) for i, slot in enumerate(order) if over[i]]
 
 
-def evaluate(task: Task, act: collect.Act, episodes: int, seed: int, at_most: int | None = None) -> np.ndarray:
+def evaluate(
+    task: Task, act: collect.Act, episodes: int, seed: int, at_most: int | None = None, longest: int | None = None
+) -> np.ndarray:
     """`collect.evaluate` for an `act` that takes many states at once, [n, S] -> [n, A]: the same returns, sooner."""
     if not applies(task):
-        return collect.evaluate(task, act, episodes, seed, at_most)
+        return collect.evaluate(task, act, episodes, seed, at_most, longest)
     rng = np.random.default_rng(seed)
     seeds = (collect.seed_of(rng) for _ in range(episodes))
-    played = play(task, lambda states, numbers, steps: act(states), seeds, at_most or math.inf)
+    played = play(task, lambda states, numbers, steps: act(states), seeds, at_most or math.inf, longest)
     return np.array([e.rewards.sum(dtype=np.float64) for e in played])
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from metrpo.world import collect
 from metrpo.world.collect import Act
+from metrpo.world.limits import RECORDED
 from metrpo.world.task import Task
 
 EPISODES, STEPS = 10, 10_000
@@ -44,7 +45,7 @@ class Yardsticks:
 
 
 def measure(task: Task, episodes: int | None = None, seed: int = 0) -> Yardsticks:
-    """Plays `episodes` real episodes each way (by default up to 10), from the same start states.
+    """Plays `episodes` real episodes each way (by default up to 10), from the same start states, cut as in evaluation.
 
     Raises `TaskError` where the environment fails.
     """
@@ -61,7 +62,7 @@ def measure(task: Task, episodes: int | None = None, seed: int = 0) -> Yardstick
 
 
 def _measured(task: Task, act: Act, episodes: int, seed: int) -> Yardstick:
-    returns = collect.evaluate(task, act, episodes, seed)
+    returns = collect.evaluate(task, act, episodes, seed, longest=RECORDED)
     return Yardstick(float(np.mean(returns)), float(np.std(returns)), episodes)
 
 

@@ -1,0 +1,34 @@
+"""The budget of a run, iterations or real steps: what is left of it, and what the next iteration may collect."""
+
+from __future__ import annotations
+
+import math
+
+from metrpo.config import Config
+
+
+def steps_left(config: Config, real_steps: int) -> float:
+    """Real steps that may still be played after `real_steps`; infinity where the budget is of iterations."""
+    return math.inf if config.real_steps is None else max(0, config.real_steps - real_steps)
+
+
+def steps_wanted(config: Config, real_steps: int) -> int:
+    """Real steps that the next iteration collects: as many as the settings say, or what is left of the budget."""
+    return int(min(config.collect.steps, steps_left(config, real_steps)))
+
+
+def finished(config: Config, iteration: int, real_steps: int) -> bool:
+    """Whether the budget is spent after so many iterations and real steps."""
+    if config.real_steps:
+        return real_steps >= config.real_steps
+    return iteration >= config.iterations
+
+
+def iterations_left(config: Config, iteration: int, real_steps: int) -> int | None:
+    """About how many iterations follow; None where the first one has to say how many real steps one takes."""
+    if not config.real_steps:
+        return config.iterations - iteration
+    left = steps_left(config, real_steps)
+    if not real_steps:
+        return None
+    return math.ceil(left * iteration / real_steps)
