@@ -13,10 +13,15 @@ import numpy as np
 import pytest
 
 import probe
-from helpers import random_policy
+from helpers import random_ensemble, random_policy
 from metrpo import algorithm, scales, training
 from metrpo.config import CollectConfig
 from metrpo.errors import RunDirectoryError
+from metrpo.model import ensemble as ensembles
+from metrpo.model.diagnostics import unknown
+from metrpo.model.ensemble import Ensemble
+from metrpo.model.fit import FitInfo
+from metrpo.phase import PhaseInfo
 from metrpo.presets import override, preset
 from metrpo.run import directory as directories
 from metrpo.run.checkpoint import load_state, save_state
@@ -213,7 +218,36 @@ def test_an_episode_on_disk_keeps_its_digits_and_an_old_one_is_read(tmp_path):
 # ---------------------------------------------------------------- the loop
 
 
-def test_a_run_with_an_offset_resumes_byte_for_byte(tmp_path, known, monkeypatch):
+def learn_at_once(monkeypatch):
+    """Instead of what has to be compiled: a fit and a policy that depend on the dataset's states and origin alone."""
+    two = np.zeros(2)
+
+    def fit(config, task, networks, dataset, iteration, progress):
+        normaliser = ensembles.normaliser_of(dataset.train, 1e-8, 1e-8, task.unseen)
+        return Ensemble(networks, normaliser), FitInfo(1, two, two, two, two > 1, two > 1)
+
+    def improve(config, task, state, dataset, *_):
+        weights, bias = state.policy.layers[-1]
+        seen = dataset.train.states.std() + (dataset.origin - [1e8, 1e8]).sum()
+        layers = (*state.policy.layers[:-1], (weights, np.asarray(bias) + np.float32(seen)))
+        info = PhaseInfo(two, 5, 1, 0, 1, two, 0.0, 0.0)
+        return state.policy._replace(layers=layers), state.baseline, info
+
+    def networks(config, task, key):
+        return random_ensemble(0, 2, task.state_size, task.action_size).networks
+
+    monkeypatch.setattr(algorithm, "_fresh_networks", networks)
+    monkeypatch.setattr(algorithm.gaussian, "init", lambda key, s, a, hidden, std: random_policy(0, s, a, hidden))
+    monkeypatch.setattr(algorithm, "init_baseline", lambda *_: np.zeros(1, np.float32))
+    monkeypatch.setattr(algorithm, "_fit", fit)
+    monkeypatch.setattr(algorithm, "_improve", improve)
+    monkeypatch.setattr(algorithm, "_diagnosis", lambda _, task, *rest: unknown(task.state_size, probe.HORIZON))
+
+
+@pytest.mark.parametrize("learns", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_run_with_an_offset_resumes_byte_for_byte(tmp_path, known, monkeypatch, learns):
+    if not learns:
+        learn_at_once(monkeypatch)
     monkeypatch.setattr(directories, "draw_curve", lambda *_: None)
     said, task = [], known(seen(1, 1e8))
     monkeypatch.setattr(scales, "warn", lambda config, task, *_: said.append(task.name))
@@ -305,6 +339,13 @@ def test_a_policy_that_sees_states_as_they_are_says_so(scale, settings):
     advice = " ".join(f.advice for f in found)
     assert settings <= set(advice.replace(",", "").split())
     assert ("std_floor" in advice) == (scale < 1), "which hides small ones from the models"
+
+
+def test_the_record_counts_the_dimensions_that_are_named(monkeypatch):
+    rounded = episode()._replace(states=(episode().states + 1e6).astype(np.float32))
+    plain = preset("Swimmer")
+    assert scales.count(plain, probe.PROBE, dataset_of([rounded]), [rounded]) == 2
+    assert scales.count(plain, probe.PROBE, dataset_of([episode()]), [episode()]) == 0
 
 
 def test_relative_leaves_states_without_an_origin_alone():

@@ -275,11 +275,13 @@ def learn(
         progress.stage("evaluate", config.evaluation_episodes)
         returns = recorded_returns(config, task, policy, iteration, origin=dataset.origin)
         trust = _end_calibration(task, dataset, ensemble, iteration)
+        unfit = partial(scales.count, config, task, dataset, episodes)
     collected = float(np.mean([e.rewards.sum() for e in episodes])) if episodes else math.nan
     row = _row(
         config, following, returns, collected, fitted, improved, phase.is_cut(config, task) or task.horizon > RECORDED
     )
-    row |= {"failed_episodes": failed}
+    row |= {"failed_episodes": failed, "failed_evaluation": failed_evaluation(task, returns)}
+    row |= {"unfit_dimensions": recorded("unfit_dimensions", iteration, unfit, math.nan)}
     row |= diagnosis.row() | {f"improved_{k}": float(share) for k, share in enumerate(improved.improved)}
     return following, row | trust | clock.row()
 
@@ -312,6 +314,11 @@ def recorded_returns(
             return evaluate(config, task, policy, iteration, stage, origin)
 
     return recorded("return_real", iteration, returns, np.array([math.nan]))
+
+
+def failed_evaluation(task: Task, returns: np.ndarray) -> int:
+    """1 where there is no real return though the task has an environment, else 0."""
+    return int(task.playable and not np.isfinite(returns).all())
 
 
 def _diagnosis(config: Config, task: Task, state: State, ensemble: Ensemble) -> Diagnosis:

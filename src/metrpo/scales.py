@@ -41,6 +41,11 @@ def warn(config: Config, task: Task, dataset: Dataset, episodes: list[Episode]) 
         _log.warning("%s: observed %s: %s; %s", task.name, names, found.why, found.advice)
 
 
+def count(config: Config, task: Task, dataset: Dataset, episodes: list[Episode]) -> int:
+    """How many dimensions cannot be learned from as they are: a number for the record."""
+    return len({d for found in findings(config, task, dataset, episodes) for d in found.dimensions})
+
+
 def named(task: Task, dimension: int) -> str:
     """A dimension by its number, and by its name where the observation has named parts."""
     parts = task.interface.observation if task.interface else ()

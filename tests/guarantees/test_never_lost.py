@@ -100,6 +100,7 @@ def test_no_record_costs_what_is_learned(monkeypatch, caplog):
     monkeypatch.setattr(Sick, "close", fails)
     monkeypatch.setattr(algorithm, "diagnose", fails)
     monkeypatch.setattr(algorithm, "end_calibration", fails)
+    monkeypatch.setattr(algorithm.scales, "count", fails)
     caplog.clear()
     found, row = algorithm.learn(config, state, episodes)
     assert str(found) == str(expected)
@@ -113,14 +114,17 @@ def test_no_record_costs_what_is_learned(monkeypatch, caplog):
         "disagreement_real",
         "disagreement_imagined",
         "saturated",
+        "unfit_dimensions",
     }
+    assert (sound["failed_evaluation"], row["failed_evaluation"]) == (0, 1)
     assert unknown == measured | {name for name in row if name.startswith(("error_", "end_"))} - {"end_recall"}
     told = [record.getMessage() for record in caplog.records]
     assert told[0] == ("iteration 1 has no diagnostics (RuntimeError: no model of it); what it has learned is kept")
     assert told[1].startswith("Ending: close() raised RuntimeError: no model of it")
     assert told[2].startswith("iteration 1 has no return_real (evaluate, iteration 1: Ending: step 3 of an episode: ")
     assert told[3].startswith("iteration 1 has no calibration (RuntimeError")
-    assert len(told) == 4
+    assert told[4].startswith("iteration 1 has no unfit_dimensions (RuntimeError")
+    assert len(told) == 5
 
 
 def _learn_nothing(monkeypatch):

@@ -37,7 +37,9 @@ def is_clock(column: str) -> bool:
     return column.startswith("seconds_") or column == "wall_seconds"
 
 
-_LATER = re.compile(r"members_reset|failed_episodes|(error|disagreement|improved)_\w+|outside|saturated")
+_LATER = re.compile(
+    r"members_reset|failed_episodes|failed_evaluation|unfit_dimensions|(error|disagreement|improved)_\w+|outside|saturated"
+)
 """Columns that runs begun with an earlier version do not have."""
 _DETAIL = re.compile(r"error_\w+_\d+|improved_\d+")
 """Columns of one state dimension or one model."""

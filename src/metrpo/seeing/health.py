@@ -27,6 +27,7 @@ CHECKS: tuple[Callable[[Sequence[Row], Config], Concern | None], ...] = (
     policy_signs.std_collapsed,
     policy_signs.saturated,
     model_signs.models_blind,
+    model_signs.unfit_dimensions,
     model_signs.member_apart,
     model_signs.loss_rises,
     policy_signs.never_stopped,

@@ -85,6 +85,24 @@ def models_blind(rows: Sequence[Row], config: Config) -> Concern | None:
     )
 
 
+def unfit_dimensions(rows: Sequence[Row], config: Config) -> Concern | None:
+    """Observations have an offset or a scale in which what a step changes is lost."""
+    dimensions = column(rows, "unfit_dimensions")
+    since = since_when(rows, dimensions > 0)
+    if since is None:
+        return None
+    number = int(dimensions[-1])
+    return Concern(
+        "unfit-dimensions",
+        "warning",
+        since,
+        f"{number} observed dimension{'s' if number > 1 else ''} of an offset or a scale that cannot be learned from",
+        "float32, the bounds of imagination or the scales of policy and models hide how these change",
+        "the first iteration of metrpo train names them and says what to do; give differences from something near, or "
+        "another unit",
+    )
+
+
 def member_apart(rows: Sequence[Row], config: Config) -> Concern | None:
     """One model is far worse than the others on held-out data."""
     losses = losses_of(rows)

@@ -60,9 +60,11 @@ def return_fell(rows: Sequence[Row], config: Config) -> Concern | None:
 
 def not_evaluated(rows: Sequence[Row], config: Config) -> Concern | None:
     """The evaluation fails. Without an environment there is none, by right."""
-    real = column(rows, "return_real")
+    real, failed = column(rows, "return_real"), column(rows, "failed_evaluation")
     since = since_when(rows, ~np.isfinite(real))
-    if since is None or not np.isfinite(real).any():
+    # Rows from before that column do not say why there is none.
+    has_environment = np.isfinite(real).any() or (failed == 1).any() or config.method != "model-based"
+    if since is None or not has_environment:
         return None
     return Concern(
         "not-evaluated",
