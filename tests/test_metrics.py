@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from tensorboardX.proto.event_pb2 import Event
 
+from metrpo.run import report
 from metrpo.run.metrics import Events, plain, read_metrics, to_csv, without_clocks
 from metrpo.run.report import draw_curve
 
@@ -93,3 +94,17 @@ def test_a_curve_is_drawn_whatever_the_numbers(tmp_path, rows):
         assert picture.size == (1350, 1050)
         assert len(set(picture.convert("L").tobytes())) > 10
     assert [p.name for p in tmp_path.iterdir()] == ["curve.png"]
+
+
+def test_imagined_points_lie_within_the_axis_where_no_evaluation_succeeded(monkeypatch, tmp_path):
+    limits, drawn = [], report._draw_returns
+    monkeypatch.setattr(
+        report, "_draw_returns", lambda axes, *rest: (drawn(axes, *rest), limits.append(axes.get_ylim()))
+    )
+    row = CURVE | {"return_real": math.nan, "return_real_std": math.nan, "return_imagined": 900.0, "real_steps": 100}
+    for r in (row, row | {"return_real": 1.0, "return_real_std": 0.1}):
+        draw_curve([r], tmp_path / "curve.png", "Swimmer", {"doing nothing": 0.0, "random actions": -1.0})
+    (low, high), (_, beside_real) = limits
+    assert low < -1
+    assert high > 900
+    assert beside_real < 900, "a real curve is not flattened"

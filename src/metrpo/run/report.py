@@ -60,7 +60,7 @@ def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row], yardsticks
     real, std, collected, imagined = (
         _column(rows, name) for name in ("return_real", "return_real_std", "return_collected", "return_imagined")
     )
-    played = np.isfinite(real).any()  # not where another program does
+    played = bool(np.isfinite(real).any())  # not where another program does
     if played:
         axes.fill_between(
             steps, real - std, real + std, color=_REAL, alpha=0.15, linewidth=0, label="± 1 std over episodes"
@@ -81,12 +81,17 @@ def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row], yardsticks
         axes.axhline(level, color="#333333", linewidth=1.1, linestyle=style, label=f"{name} ({level:.4g})")
     axes.set_ylabel("return of an episode")
     levels = np.array(list(yardsticks.values()))
-    axes.set_ylim(_frame(np.concatenate([real - std, real + std, collected, levels]), imagined))
+    axes.set_ylim(_frame(np.concatenate([real - std, real + std, collected, levels]), imagined, played))
     axes.legend(loc="best", frameon=False, fontsize=9)
 
 
-def _frame(real: np.ndarray, others: np.ndarray) -> tuple[float, float] | None:
-    """Limits of the return axis: early models may promise a hundredfold, which must not flatten the real curve."""
+def _frame(real: np.ndarray, others: np.ndarray, flattens: bool = True) -> tuple[float, float] | None:
+    """Limits of the return axis: early models may promise a hundredfold, which must not flatten the real curve.
+
+    Where there is no such curve (`flattens` is false) nothing is left outside.
+    """
+    if not flattens:
+        real = np.concatenate([real, others])
     if not np.isfinite(real).any():
         return None
     low, high = np.nanmin(real), np.nanmax(real)
