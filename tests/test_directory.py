@@ -214,7 +214,7 @@ def test_killed_between_checkpoint_and_metrics(tmp_path, monkeypatch):
     train(tmp_path / "cut", until=2)
     before = (tmp_path / "cut" / "metrics.csv").read_bytes()
     with monkeypatch.context() as patch:
-        patch.setattr(RunDirectory, "_publish", lambda *_: None)
+        patch.setattr(RunDirectory, "_publish", lambda *_, **__: None)
         train(tmp_path / "cut", until=3)
         assert (tmp_path / "cut" / "metrics.csv").read_bytes() == before
     assert train(tmp_path / "cut", until=3) == []
@@ -299,7 +299,7 @@ class Heard(Progress):
     def __init__(self) -> None:
         self.heard: list[tuple] = []
 
-    def resume(self, where: str, iteration: int, of: int | None, real_steps: int) -> None:
+    def resume(self, where: str, iteration: int, of: int | None, real_steps: int, waiting: int = 0) -> None:
         self.heard.append((where, iteration, of, real_steps))
 
 
@@ -315,6 +315,46 @@ def test_training_says_where_a_run_is_taken_up(tmp_path, monkeypatch, budget, ex
     training.train(dataclasses.replace(config, **budget), tmp_path, again)
     assert first.heard == [], "nothing to resume"
     assert again.heard == [(str(tmp_path), 3, expected, a_state(2).real_steps)]
+
+
+def test_a_finished_run_started_again_writes_only_what_is_missing(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "draw_curve", lambda rows, path, *_: path.write_text(f"{len(rows)} rows"))
+    train(tmp_path, until=2)
+
+    def times():
+        return {str(p): p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.is_file() and p.name != ".lock"}
+
+    before = times()
+    train(tmp_path, until=2)
+    assert times() == before
+    for name in ("curve.png", "policy.json"):
+        (tmp_path / name).unlink()
+    (tmp_path / "policy.npz").write_bytes(b"torn")
+    train(tmp_path, until=2)
+    assert (tmp_path / "curve.png").read_text() == "2 rows"
+    assert load_policy(tmp_path).info.iteration == 2
+    changed = {name for name, time in times().items() if before[name] != time}
+    assert changed == {str(tmp_path / name) for name in ("curve.png", "policy.json", "policy.npz")}
+
+
+def test_a_curve_from_before_the_checkpoint_is_drawn_anew(tmp_path, monkeypatch):
+    """It could not be drawn then, though all else was written."""
+    monkeypatch.setattr(module, "draw_curve", lambda rows, path, *_: path.write_text(f"{len(rows)} rows"))
+    train(tmp_path, until=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "draw_curve", lambda *_: 1 / 0)
+        train(tmp_path, until=2)
+    assert (tmp_path / "curve.png").read_text() == "1 rows"
+    train(tmp_path, until=2)
+    assert (tmp_path / "curve.png").read_text() == "2 rows"
+
+
+def test_the_time_left_does_not_count_the_compilation():
+    assert training._seconds_left([60.0], 9) is None
+    assert training._seconds_left([60.0, 2.0], 9) == 18
+    assert training._seconds_left([60.0, 2.0, 3.0, 4.0, 5.0], 2) == 8
+    assert training._seconds_left([60.0], 0) == 0
+    assert training._seconds_left([60.0, 2.0], None) is None
 
 
 def test_the_budget_may_change(tmp_path):

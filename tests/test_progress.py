@@ -4,11 +4,21 @@ import io
 import re
 import sys
 import time
+from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from metrpo.run.progress import SILENT, Guarded, LiveProgress, PlainProgress, default_progress, duration
+from metrpo.run.progress import (
+    SILENT,
+    Guarded,
+    LiveProgress,
+    PlainProgress,
+    default_progress,
+    duration,
+    outcome,
+    summary,
+)
 
 ROW = {
     "iteration": 1,
@@ -40,6 +50,7 @@ def play(progress, pause=0.0):
     [
         (5, 20, "resuming runs/[a] at iteration 5 of 20, 12,000 real steps"),
         (5, None, "resuming runs/[a] at iteration 5, 12,000 real steps"),
+        (1, 20, "resuming runs/[a] at iteration 1 of 20, 12,000 real steps and 600 that wait"),
         (5, 4, "runs/[a] is finished: 4 iterations, 12,000 real steps; a larger budget goes on"),
     ],
 )
@@ -51,8 +62,22 @@ def test_a_resumed_run_says_so(iteration, of, said):
         LiveProgress(Console(file=out, width=30)),
         SILENT,
     ):
-        progress.resume("runs/[a]", iteration, of, 12_000)
+        progress.resume("runs/[a]", iteration, of, 12_000, 600 if iteration == 1 else 0)
     assert out.getvalue().splitlines() == [said] * 3
+
+
+def test_what_a_run_has_earned_is_said_even_where_evaluation_failed():
+    nothing = ROW | {"return_real": float("nan"), "return_collected": 4.0}
+    run_dir = Path("a dir")
+    assert outcome(ROW, run_dir) == "return 12.3 ± 0.5 after 3,000 real steps"
+    assert outcome(nothing | {"failed_evaluation": 0}, run_dir) == "collected 4.0 after 3,000 real steps"
+    failed = outcome(nothing | {"failed_evaluation": 1}, run_dir)
+    assert failed.startswith("no return after 3,000 real steps: the last evaluation failed")
+    assert failed.endswith("metrpo evaluate 'a dir'")
+    assert "nan" not in failed
+    assert "evaluation failed, collected     4.0" in summary(nothing | {"failed_evaluation": 1})
+    baseline = {name: value for name, value in nothing.items() if name != "return_imagined"}
+    assert outcome(baseline, run_dir).startswith("no return"), "it has an environment"
 
 
 def test_plain_lines_are_one_per_stage_and_one_per_iteration():

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -18,11 +19,14 @@ from rich.console import Console
 
 from metrpo.cli import main
 from metrpo.config import Config, EnsembleConfig
+from metrpo.policy.gaussian import Policy
 from metrpo.run.claim import claim
+from metrpo.run.directory import RunDirectory
 from metrpo.seeing import watch as watching
 from metrpo.seeing.curves import curve
 from metrpo.seeing.runs import find, group, read
 from metrpo.seeing.watch import SPARKS, is_running, sparkline, standing, watch
+from metrpo.types import Episode
 from test_seeing_health import healthy
 from test_seeing_page import a_run, details
 
@@ -95,6 +99,42 @@ def test_json_says_the_same(tmp_path, capsys):
     assert a["returns"] == [pytest.approx(r["return_real"]) for r in TIMED]
     assert (b["iteration"], b["iterations"], b["return_real"], b["returns"]) == (0, None, None, [])
     assert said["skipped"] == []
+
+
+def test_steps_that_wait_are_seen(tmp_path):
+    with RunDirectory(tmp_path / "a", CONFIG) as run:
+        run.load(State(0, 0, LAYERS))
+        run.episodes.append(an_episode(30))
+        run.episodes.append(an_episode(12))
+        assert watching.waiting_steps(tmp_path / "a") == 42
+        run.episodes.pending()
+        run.save(State(1, 42, LAYERS), {"iteration": 1, "real_steps": 42, "return_real": 1.0})
+        assert (tmp_path / "a" / "episodes" / "00000001.npz").exists(), "kept for the checkpoint before"
+        assert watching.waiting_steps(tmp_path / "a") == 0
+        run.episodes.append(an_episode(1500))
+        assert standing(read(tmp_path / "a")).waiting_steps == 1500
+        assert "42 +1,500" in printed([tmp_path / "a"])
+        (tmp_path / "a" / "episodes" / "00000002.npz").write_bytes(b"torn")
+        assert standing(read(tmp_path / "a")).waiting_steps == 0
+
+
+class State(NamedTuple):
+    iteration: int
+    real_steps: int
+    policy: Policy
+
+
+LAYERS = Policy(((np.zeros((10, 2), np.float32), np.zeros(2, np.float32)),), np.zeros(2, np.float32))
+
+
+def an_episode(length):
+    return Episode(np.zeros((length + 1, 10)), np.zeros((length, 2), "f"), np.zeros(length, "f"), False)
+
+
+def test_the_time_left_does_not_count_the_compilation(tmp_path):
+    rows = [r | {"wall_seconds": 60.0 + 2.0 * r["iteration"]} for r in healthy(2)]
+    assert standing(read(a_run(tmp_path / "a", CONFIG, rows))).seconds_per_iteration == pytest.approx(2)
+    assert standing(read(a_run(tmp_path / "b", CONFIG, rows[:1]))).seconds_per_iteration == pytest.approx(62)
 
 
 def test_what_tells_runs_apart_is_shown(tmp_path, capsys):

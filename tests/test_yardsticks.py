@@ -12,6 +12,7 @@ from metrpo.errors import TaskError
 from metrpo.run import yardsticks
 from metrpo.run.directory import RunDirectory
 from metrpo.run.progress import Progress
+from metrpo.types import Episode
 from metrpo.world import registry
 from metrpo.world import yardsticks as world
 from tiny_run import CONFIG
@@ -76,6 +77,26 @@ def test_a_run_measures_them_once_keeps_and_says_them(tmp_path):
     about = json.loads((tmp_path / "run" / "run.json").read_text())
     assert about["format"] == 1
     assert about["yardsticks"]["zero"]["episodes"] == 10
+
+
+def test_a_run_killed_before_its_first_checkpoint_says_so_and_measures_nothing_again(tmp_path):
+    first, again, other = Heard(), Heard(), Heard()
+    training.train(CONFIG, tmp_path, first)
+    assert not [line for line in first.lines if "resuming" in line]
+    training.train(CONFIG, tmp_path, again)
+    assert again.lines == [f"resuming {tmp_path} at iteration 1 of 3, 0 real steps"]
+    elsewhere = dataclasses.replace(CONFIG, task="EndingProbe")
+    training.train(elsewhere, tmp_path, other)
+    assert other.lines[-1].startswith("doing nothing earns"), "those of another task"
+    with RunDirectory(tmp_path, elsewhere) as run:
+        run.episodes.append(probe_episode())
+    training.train(elsewhere, tmp_path, again)
+    assert again.lines[-1] == f"resuming {tmp_path} at iteration 1 of 3, 0 real steps and 20 that wait"
+
+
+def probe_episode():
+    states, actions, rewards = probe.rollout(probe.PROBE, 0, lambda t, s: -s)
+    return Episode(states, actions, rewards.astype(np.float32), False)
 
 
 def test_an_environment_that_fails_there_costs_a_warning(tmp_path, monkeypatch, caplog):

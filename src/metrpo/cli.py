@@ -84,7 +84,12 @@ def _train(command: Train) -> int:
     from metrpo.training import train
 
     config, run_dir = _run(command)
-    with _attended(run_dir, default_progress(), keeps_episodes=config.method == "model-based") as progress:
+
+    def complete(progress: Interruptible) -> str | None:
+        return f"{run_dir} is complete: nothing is lost. {_AGAIN}" if _is_complete(run_dir, config) else None
+
+    by_episode = config.method == "model-based"
+    with _attended(run_dir, default_progress(), keeps_episodes=by_episode, complete=complete) as progress:
         train(config, run_dir, progress)
         progress.close()
         try:
@@ -95,24 +100,47 @@ def _train(command: Train) -> int:
 
 
 @contextmanager
-def _attended(run_dir: Path, shown: Progress, keeps_episodes: bool = True) -> Iterator[Interruptible]:
-    """What reports on a run in this block; whoever or whatever stops the run there is told how to go on."""
+def _attended(
+    run_dir: Path,
+    shown: Progress,
+    keeps_episodes: bool = True,
+    complete: Callable[[Interruptible], str | None] = lambda progress: None,
+) -> Iterator[Interruptible]:
+    """What reports on a run in this block; whoever or whatever stops the run there is told how to go on.
+
+    `complete` says what is true where a signal came too late to stop anything; else None.
+    """
     with Interruptible(shown, keeps_episodes) as progress:
         try:
             yield progress
         except (Stopped, KeyboardInterrupt, MetrpoError) as error:
             # What else goes wrong (a file that is missing, a policy that diverged) would do so again.
             may_go_on = isinstance(error, KeyboardInterrupt | EpisodeError | RunDirectoryError)
-            if isinstance(error, Stopped) or (progress.began and may_go_on):
+            if isinstance(error, Stopped | KeyboardInterrupt) and (note := complete(progress)):
+                error.add_note(note)
+            elif isinstance(error, Stopped) or (progress.began and may_go_on):
                 error.add_note(f"{run_dir} keeps every finished iteration and real episode. The same command goes on.")
             raise
         finally:
             progress.close()
 
 
+_AGAIN = "The same command would only make what is missing of its record, such as the video."
+
+
+def _is_complete(run_dir: Path, config: Config) -> bool:
+    """Whether all iterations that were asked for are on disk."""
+    from metrpo.seeing.runs import is_finished, read
+
+    with suppress(MetrpoError):
+        return is_finished(dataclasses.replace(read(run_dir), config=config))
+    return False
+
+
 def _say_how_to_go_on(error: BaseException, arguments: Sequence[str]) -> None:
     for note in getattr(error, "__notes__", ()):
-        _say(f"metrpo: stopped; {note}\n\n  {shlex.join(['metrpo', *arguments])}\n")
+        command = f"\n\n  {shlex.join(['metrpo', *arguments])}\n" if "same command" in note else ""
+        _say(f"metrpo: stopped; {note}{command}")
 
 
 def _occupy_standard_files() -> None:
@@ -180,7 +208,11 @@ def _improve(command: Improve) -> int:
     from metrpo.run.progress import SILENT, default_progress
     from metrpo.stepwise import improve
 
-    with _attended(command.dir, SILENT if command.json else default_progress()) as progress:
+    def complete(progress: Interruptible) -> str | None:
+        done = f"{command.dir} has learned from the episodes that waited: nothing is lost, and nothing is left to do."
+        return done if progress.ended else None
+
+    with _attended(command.dir, SILENT if command.json else default_progress(), complete=complete) as progress:
         row = improve(command.dir, progress, command.task)
     print(_json(row) if command.json else f"  policy   {command.dir / FILE}")
     return 0
@@ -190,11 +222,11 @@ def _report(run_dir: Path, video: bool) -> None:
     """Says what the run has earned and where its files lie; a machine that cannot make a video costs the video only."""
     from metrpo.evaluation import render
     from metrpo.run.metrics import read_metrics
+    from metrpo.run.progress import outcome
     from metrpo.run.video import VideoError
 
     last = read_metrics(run_dir / "metrics.csv")[-1]
-    steps = counted(int(last["real_steps"] or 0), "real step")
-    print(f"return {last['return_real']:.1f} ± {last['return_real_std']:.1f} after {steps}")
+    print(outcome(last, run_dir))
     files = {"curve": "curve.png", "metrics": "metrics.csv", "policy": "policy.npz"}
     for what, name in files.items():
         print(f"  {what:<8} {run_dir / name}", flush=True)
@@ -202,9 +234,19 @@ def _report(run_dir: Path, video: bool) -> None:
         return
     print(f"  {'video':<8} ", end="", flush=True)  # it takes a while
     try:
-        print(render(run_dir))
+        print(_video_of(run_dir) or render(run_dir))
     except Exception as error:  # the run is complete without it
         print(f"none: {error}" if isinstance(error, VideoError) else f"none ({type(error).__name__}: {error})")
+
+
+def _video_of(run_dir: Path) -> Path | None:
+    """The run's video, if there is one of its policy as it is now."""
+    from metrpo.run.policy_file import FILE
+
+    video = run_dir / "video.mp4"
+    with suppress(OSError):
+        return video if video.stat().st_mtime_ns >= (run_dir / FILE).stat().st_mtime_ns else None
+    return None
 
 
 def _evaluate(command: Evaluate) -> int:

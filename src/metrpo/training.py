@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,13 @@ from metrpo.memory import require_memory
 from metrpo.run import task_file
 from metrpo.run.directory import RunDirectory, Saved
 from metrpo.run.progress import SILENT, Progress
-from metrpo.run.yardsticks import keep
+from metrpo.run.yardsticks import are_kept, keep
 from metrpo.seeds import Stage, rng_of
 from metrpo.world.check import check_formulas
 from metrpo.world.known import KNOWN
 from metrpo.world.limits import RECORDED
 from metrpo.world.registry import get_task
+from metrpo.world.returned import warning_once
 from metrpo.world.yardsticks import measure
 
 _log = logging.getLogger("metrpo")
@@ -77,21 +78,33 @@ def train(config: Config, run_dir: str | Path | None = None, progress: Progress 
     The formulas of a task of the user's own are checked first (`metrpo.world.check`). Raises `TaskError` for an unknown
     or broken task and `RunDirectoryError` when `run_dir` cannot be used (see `RunDirectory`).
     """
+    with warning_once():
+        return _train(config, run_dir, progress)
+
+
+def _train(config: Config, run_dir: str | Path | None, progress: Progress) -> Saved:
     template = init(config)
     if run_dir is None:
         check(config)
         return _loop(config, template, progress, lambda state, row: row)
     with RunDirectory(run_dir, config) as run:
         task_file.remember(run_dir, config.task)
-        state = run.load(template)
+        state, measured = run.load(template), are_kept(run.path, config.task)
+        _say_where(config, run, state or template, measured, progress)
         if state is None:
             check(config)
-            _measure_yardsticks(config, run, progress)
-        elif state.iteration or state.real_steps:
-            left = _iterations_left(config, state)
-            of = None if left is None else state.iteration + max(left, 0)
-            progress.resume(str(run_dir), state.iteration + 1, of, state.real_steps)
+            if not measured:
+                _measure_yardsticks(config, run, progress)
         return _loop(config, state or template, progress, run.save, run.episodes)
+
+
+def _say_where(config: Config, run: RunDirectory, state: Saved, measured: bool, progress: Progress) -> None:
+    """Says that a run is taken up, where one is: also one that has finished no iteration."""
+    waiting = run.episodes.waiting_steps()
+    if state.iteration or state.real_steps or waiting or measured:
+        left = _iterations_left(config, state)
+        of = None if left is None else state.iteration + max(left, 0)
+        progress.resume(str(run.path), state.iteration + 1, of, state.real_steps, waiting)
 
 
 def check(config: Config) -> None:
@@ -121,7 +134,7 @@ def _measure_yardsticks(config: Config, run: RunDirectory, progress: Progress) -
     except MetrpoError as error:  # a record may not cost the run
         _log.warning("what doing nothing and random actions earn could not be measured: %s", error)
         return
-    keep(run.path, found.record())
+    keep(run.path, config.task, found.record())
     progress.say(found.text())
 
 
@@ -140,13 +153,20 @@ def _loop(
             progress.begin(state.iteration + 1, None if left is None else state.iteration + left)
             state, row = step(config, state, progress, log)
             written = save(state, row)
-            # Of the last three: iterations grow with the data, and the first one compiled.
-            seconds = [*seconds, time.monotonic() - started][-3:]
-            left = _iterations_left(config, state)
-            progress.end(written, None if left is None else left * float(np.mean(seconds)))
+            seconds.append(time.monotonic() - started)
+            progress.end(written, _seconds_left(seconds, _iterations_left(config, state)))
     finally:
         progress.close()
     return state
+
+
+def _seconds_left(seconds: Sequence[float], iterations: int | None) -> float | None:
+    """About how long so many iterations take, by the last three: they grow with the data. The first one compiled."""
+    if iterations == 0:
+        return 0.0
+    if iterations is None or len(seconds) < 2:
+        return None
+    return iterations * float(np.mean(seconds[1:][-3:]))
 
 
 def _iterations_left(config: Config, state: Saved) -> int | None:

@@ -109,6 +109,24 @@ def test_the_second_ends_it_at_once_and_loses_the_step_only(stage, tmp_path, exp
     assert_it_goes_on(tmp_path / "run", expected)
 
 
+def test_in_the_last_evaluation_nothing_goes_on(tmp_path, expected, monkeypatch, capfd):
+    """The iteration is finished and saved: only a part of the record can be missing."""
+    run_dir = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        send(patch, signal.SIGTERM, 1, tiny_run.ITERATIONS, "evaluate")
+        assert cli.main(command_line(run_dir)) == 143
+    err = capfd.readouterr().err
+    assert "goes on" not in err
+    command = shlex.join(["metrpo", *command_line(run_dir)])
+    again = f"The same command would only make what is missing of its record, such as the video.\n\n  {command}\n"
+    assert f"metrpo: stopped; {run_dir} is complete: nothing is lost. {again}" in err
+    assert differing(result(run_dir), expected) == []
+    with monkeypatch.context() as patch:
+        send(patch, signal.SIGTERM, 1, tiny_run.ITERATIONS + 1, "collect")
+        assert cli.main(command_line(run_dir, "--iterations", str(tiny_run.ITERATIONS + 1))) == 143
+    assert "The same command goes on." in capfd.readouterr().err, "a larger budget is not spent"
+
+
 @pytest.mark.parametrize("times", [1, 2])
 def test_while_a_checkpoint_is_written(times, tmp_path, expected, monkeypatch):
     fsync, left = os.fsync, [times]
@@ -149,6 +167,8 @@ def test_the_single_steps_too(number, code, tmp_path, expected, monkeypatch, cap
     with monkeypatch.context() as patch:
         send(patch, number, 1, 1, "improve")
         assert cli.main(["improve", str(run_dir)]) == code
+    assert "nothing is left to do.\n" in (err := capfd.readouterr().err)
+    assert "metrpo improve" not in err, "given again it would find no episodes"
     assert finished(run_dir) == [1]
     assert_it_goes_on(run_dir, expected)
 

@@ -8,7 +8,8 @@
     DIR/episodes/      real episodes that the state has not learned from (see `metrpo.run.episodes`)
 
 The newest checkpoint is the run: it holds the state and all rows. Everything else is derived from it, written after it
-and again when the run is resumed, so that a kill at any moment leaves nothing twice and nothing missing.
+and what is missing or old again when the run is resumed, so that a kill at any moment leaves nothing twice and nothing
+missing.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from metrpo.run.metrics import (
     to_csv,
     without_clocks,
 )
-from metrpo.run.policy_file import Interface, Weights, save_policy
+from metrpo.run.policy_file import Interface, Weights, load_policy, save_policy
 from metrpo.run.report import draw_curve
 from metrpo.untrusted import text_of
 from metrpo.world.registry import get_task
@@ -133,7 +134,7 @@ class RunDirectory:
         self.episodes.start(after=meta.get("episodes", 0))
         self._taken = [self.episodes.taken]
         self._write_config()
-        self._publish(state)
+        self._publish(state, missing_only=self._is_published())
         return state
 
     def begin(self, state: Saved) -> None:
@@ -215,27 +216,56 @@ class RunDirectory:
 
     def _write_config(self) -> None:
         # The budget may be another one than last time.
-        atomic_write(self.path / "config.json", configs.to_json(self.config))
+        file, text = self.path / "config.json", configs.to_json(self.config)
+        if not _holds(file, text):
+            atomic_write(file, text)
 
-    def _publish(self, state: Saved) -> None:
+    def _is_published(self) -> bool:
+        """Whether all that derives from these rows has been written: metrics.csv is the last file to be."""
+        return bool(self.rows) and _holds(self.path / "metrics.csv", to_csv([overview(row) for row in self.rows]))
+
+    def _publish(self, state: Saved, missing_only: bool = False) -> None:
         for old in self._checkpoints()[:-_KEPT]:
             with contextlib.suppress(OSError):  # costs room only
                 old.unlink()
+        writers: dict[str, Callable[[], None]] = {"policy.npz": lambda: self._write_policy(state)}
+        if self.rows:
+            writers |= {
+                "curve.png": lambda: self._derive("learning curve", self._draw_curve),
+                "events/events.*": lambda: self._derive("TensorBoard events", self._write_events),
+                "diagnostics.csv": self._write_details,
+                # Last: a run counts as finished, and is not begun again, by the rows in this file.
+                "metrics.csv": lambda: atomic_write(
+                    self.path / "metrics.csv", to_csv([overview(row) for row in self.rows])
+                ),
+            }
+        for name, write in writers.items():
+            if not (missing_only and self._has(name)):
+                write()
+
+    def _has(self, name: str) -> bool:
+        """Whether there is such a file, sound and no older than the checkpoint that it derives from."""
+        checkpoint = self._checkpoints()[-1].stat().st_mtime_ns
+        with contextlib.suppress(RunDirectoryError):
+            if name == "policy.npz":
+                load_policy(self.path)
+            return any(path.stat().st_mtime_ns >= checkpoint for path in self.path.glob(name))
+        return False
+
+    def _write_policy(self, state: Saved) -> None:
         result = self.rows[-1].get("return_real") if self.rows else None
         result = result if result is not None and math.isfinite(result) else None
         progress = (state.iteration, state.real_steps, result)
         origin = getattr(state, "origin", None)  # baselines have none
         save_policy(self.path, state.policy, self.config.task, *progress, _interface(self.config.task), origin)
-        if not self.rows:
-            return
+
+    def _draw_curve(self) -> None:
         title = f"{self.config.task}, {self.config.system}, {self.config.preset}, seed {self.config.seed}"
-        lines = yardsticks.kept(self.path)
-        self._derive("learning curve", lambda: draw_curve(self.rows, self.path / "curve.png", title, lines))
-        self._derive("TensorBoard events", self._write_events)
+        draw_curve(self.rows, self.path / "curve.png", title, yardsticks.kept(self.path))
+
+    def _write_details(self) -> None:
         if all(rows := [details(row) for row in self.rows]):
             atomic_write(self.path / "diagnostics.csv", to_csv(rows))
-        # Last: a run counts as finished, and is not begun again, by the rows in this file.
-        atomic_write(self.path / "metrics.csv", to_csv([overview(row) for row in self.rows]))
 
     def _write_events(self) -> None:
         if self._events is None or not self._events.path.exists():
@@ -251,6 +281,9 @@ class RunDirectory:
             _within(_PATIENCE, write)
         except Exception as error:
             self._failed.add(what)
+            if self._events is not None and "events" in what.lower():  # torn: written anew with the next start
+                with contextlib.suppress(OSError):
+                    self._events.path.unlink()
             _log.warning("no %s from here on (%s: %s); training goes on", what, type(error).__name__, error)
 
 
@@ -271,6 +304,12 @@ def _within(seconds: float, act: Callable[[], None]) -> None:
         raise TimeoutError(f"not finished within {seconds:g} s")
     if raised:
         raise raised[0]
+
+
+def _holds(file: Path, text: str) -> bool:
+    with contextlib.suppress(OSError, UnicodeDecodeError):
+        return file.read_text() == text
+    return False
 
 
 def _interface(task: str) -> Interface | None:

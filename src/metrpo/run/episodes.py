@@ -16,13 +16,14 @@ import os
 import re
 import secrets
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from metrpo.errors import RunDirectoryError, TaskError
-from metrpo.run.files import atomic_write, read_arrays, sync_directory, write_arrays, writing
+from metrpo.run.files import atomic_write, length_of, read_arrays, read_meta, sync_directory, write_arrays, writing
 from metrpo.run.policy_file import load_policy
 from metrpo.types import Episode
 from metrpo.untrusted import brief, json_of, text_of
@@ -37,8 +38,8 @@ class EpisodeLog:
 
     def __init__(self, run_dir: Path, writer: str | None = None) -> None:
         # The name of the only writer there is may come again, over what a kill has left; others are never the same.
-        self._folder, self._writer = run_dir / "episodes", writer or f"{os.getpid()}-{secrets.token_hex(4)}"
-        self._failed = self._folder / "failed.json"
+        self.folder, self._writer = run_dir / "episodes", writer or f"{os.getpid()}-{secrets.token_hex(4)}"
+        self._failed = self.folder / "failed.json"
         self.widths: tuple[int, int] | None = None
         """How many numbers a state and an action of this run have, where that is known."""
         self.start(after=0)
@@ -81,8 +82,13 @@ class EpisodeLog:
         self.read = max([self.taken, *(n + 1 for n in numbers)])
         if lost := self.read - self.taken - len(numbers):
             span = f"{self.taken:08d} and {self.read - 1:08d}"
-            _log.warning("%s: %d real episodes between %s are gone; going on without them", self._folder, lost, span)
+            _log.warning("%s: %d real episodes between %s are gone; going on without them", self.folder, lost, span)
         return [self._load(n) for n in numbers]
+
+    def waiting_steps(self) -> int:
+        """Real steps that the state has not learned from, as far as their files say."""
+        paths = [self._path(n) for n in self._numbers() if n >= self.taken]
+        return sum(_steps_in(path, path.stat().st_mtime_ns) for path in paths)
 
     def append(self, episode: Episode) -> Path:
         """Puts an episode on disk, whole or not at all, under the next free number; others may append meanwhile.
@@ -92,7 +98,7 @@ class EpisodeLog:
         number = max([self.taken, *(n + 1 for n in self._numbers())])
         arrays = {**episode._asdict(), "terminated": np.bool_(episode.terminated)}
         arrays = {name: np.asarray(array) for name, array in arrays.items()}
-        mine = self._folder / f"from-{self._writer}.npz"
+        mine = self.folder / f"from-{self._writer}.npz"
         try:
             with writing(self._path(number)):
                 while True:
@@ -102,7 +108,7 @@ class EpisodeLog:
                         break
                     except FileExistsError:
                         number += 1
-                sync_directory(self._folder)
+                sync_directory(self.folder)
         finally:
             with contextlib.suppress(OSError):  # the episode is there, or not: what is left besides does no harm
                 mine.unlink()
@@ -118,11 +124,11 @@ class EpisodeLog:
 
     def _numbers(self) -> list[int]:
         # Each number has one name only, so that no episode counts twice.
-        found = (re.fullmatch(r"([0-9]{8}|[1-9][0-9]{8,17})\.npz", path.name) for path in self._folder.glob("*.npz"))
+        found = (re.fullmatch(r"([0-9]{8}|[1-9][0-9]{8,17})\.npz", path.name) for path in self.folder.glob("*.npz"))
         return sorted(int(match[1]) for match in found if match)
 
     def _path(self, number: int) -> Path:
-        return self._folder / f"{number:08d}.npz"
+        return self.folder / f"{number:08d}.npz"
 
     def _load(self, number: int) -> Episode:
         path = self._path(number)
@@ -152,6 +158,30 @@ class EpisodeLog:
                 expected = np.dtype(kinds[0]).name
                 raise ValueError(f"{name}: expected finite numbers of {expected}, got {array.dtype} or others")
         return Episode(arrays["states"], arrays["actions"], arrays["rewards"], bool(arrays["terminated"]))
+
+
+def waiting_steps(run_dir: Path) -> int:
+    """Real steps that wait in a run's directory, as one sees it from outside; 0 where that cannot be read."""
+    log = EpisodeLog(run_dir)
+    try:
+        if not log.folder.is_dir():
+            return 0
+        if newest := max(run_dir.glob("checkpoints/iteration-*.npz"), default=None):
+            log.start(after=_taken_by(newest, newest.stat().st_mtime_ns))
+        return log.waiting_steps()
+    except (OSError, RunDirectoryError):
+        return 0
+
+
+@lru_cache(maxsize=1000)
+def _taken_by(checkpoint: Path, written: int) -> int:
+    taken = read_meta(checkpoint).get("episodes", 0)
+    return taken if type(taken) is int else 0
+
+
+@lru_cache(maxsize=10_000)
+def _steps_in(path: Path, written: int) -> int:
+    return length_of(path, "rewards")
 
 
 def _finite(array: np.ndarray) -> bool:

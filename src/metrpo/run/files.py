@@ -15,9 +15,10 @@ import re
 import subprocess
 import zipfile
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any, BinaryIO
 
 import numpy as np
 
@@ -29,6 +30,8 @@ FORMAT = 1
 
 _META = "meta.json"
 _DIGEST_SIZE = 64
+_HEADER = 10_000
+"""Most bytes of an array's header."""
 
 
 class DamagedFile(RunDirectoryError):
@@ -56,7 +59,7 @@ def atomic_write(path: Path, content: bytes | str) -> None:
             raise
 
 
-@contextlib.contextmanager
+@contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Raises `RunDirectoryError` where `path` cannot be written in this block."""
     try:
@@ -121,6 +124,42 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise RunDirectoryError(f"{path}: {_META}: expected an object, got {type(meta).__name__}")
     check_format(meta, path)
     return arrays, meta
+
+
+def read_meta(path: Path) -> dict[str, Any]:
+    """The `meta` alone, without a look at the arrays, however large; for those who only watch.
+
+    Raises `RunDirectoryError` when there is none to be read.
+    """
+    with _member(path, _META) as file:
+        text = np.lib.format.read_array(file, allow_pickle=False, max_header_size=_HEADER).tobytes()
+    meta = json_of(text, f"{path}: {_META}", RunDirectoryError)
+    if not isinstance(meta, dict):
+        raise RunDirectoryError(f"{path}: {_META}: expected an object, got {type(meta).__name__}")
+    return meta
+
+
+def length_of(path: Path, name: str) -> int:
+    """Length of the array `name`, by its header. Raises `RunDirectoryError` when there is none to be read."""
+    with _member(path, name) as file:
+        np.lib.format.read_magic(file)
+        shape, _, _ = np.lib.format.read_array_header_1_0(file, max_header_size=_HEADER)
+    return int(shape[0]) if shape else 0
+
+
+@contextmanager
+def _member(path: Path, name: str) -> Iterator[IO[bytes]]:
+    try:
+        with zipfile.ZipFile(path) as archive:
+            info = archive.getinfo(f"{name}.npy")
+            if info.file_size > LARGEST_TEXT:
+                raise RunDirectoryError(
+                    f"{path}: {name}: expected at most {LARGEST_TEXT:,} bytes, got {info.file_size:,}"
+                )
+            with archive.open(info) as file:
+                yield file
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise RunDirectoryError(f"{path} cannot be read: {error}") from None
 
 
 def check_format(meta: Mapping[str, Any], path: Path) -> None:

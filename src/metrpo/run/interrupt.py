@@ -67,6 +67,8 @@ class Interruptible(Guarded):
         self._process = os.getpid()
         self.began = False
         """Whether an iteration has begun."""
+        self.ended = False
+        """Whether the last one that began is saved."""
 
     def __enter__(self) -> Self:
         self._process = os.getpid()
@@ -93,7 +95,7 @@ class Interruptible(Guarded):
 
     def begin(self, iteration: int, of: int | None) -> None:
         """From the first stage on something is under way."""
-        self.began = True
+        self.began, self.ended = True, False
         super().begin(iteration, of)
 
     def stage(self, name: str, total: int | None = None) -> None:
@@ -117,7 +119,7 @@ class Interruptible(Guarded):
     def end(self, row: Row, seconds_left: float | None = None) -> None:
         """The iteration is saved."""
         super().end(row, seconds_left)
-        self._stage = None
+        self._stage, self.ended = None, True
         self._stop_if_asked()
 
     def close(self) -> None:

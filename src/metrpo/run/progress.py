@@ -6,9 +6,11 @@ import contextlib
 import logging
 import math
 import os
+import shlex
 import sys
 import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from metrpo.counting import counted
@@ -27,9 +29,9 @@ class Progress:
     def say(self, text: str) -> None:
         """Something about the run that is worth a line."""
 
-    def resume(self, where: str, iteration: int, of: int | None, real_steps: int) -> None:
-        """A run is taken up: `iteration` of `of` comes next, after so many real steps."""
-        self.say(_resuming(where, iteration, of, real_steps))
+    def resume(self, where: str, iteration: int, of: int | None, real_steps: int, waiting: int = 0) -> None:
+        """A run is taken up: `iteration` of `of` comes next, after so many real steps; it has `waiting` of its own."""
+        self.say(_resuming(where, iteration, of, real_steps, waiting))
 
     def begin(self, iteration: int, of: int | None) -> None:
         """Outer iteration `iteration` (from 1) of `of` (None: unknown) begins."""
@@ -208,12 +210,32 @@ def summary(row: Row) -> str:
         f"{row.get('real_steps', 0):>7,} real steps",
         f"return {_number(row.get('return_real')):>7} ± {_number(row.get('return_real_std'))}",
     ]
-    if _is_missing(row.get("return_real")):  # only another program can play
+    if _is_missing(row.get("return_real")):
         parts[1] = f"collected {_number(row.get('return_collected')):>7}"
+        if row.get("failed_evaluation"):  # else only another program can play
+            parts[1] = f"evaluation failed, {parts[1]}"
     if "return_imagined" in row:
         parts.append(f"imagined {_number(row['return_imagined']):>7}")
     seconds = sum(v for name, v in row.items() if name.startswith("seconds_") and v is not None)
     return "  ".join([*parts, duration(seconds)] if seconds else parts)
+
+
+def outcome(row: Row, run_dir: Path) -> str:
+    """What the last iteration says of a whole run, in a line."""
+    after = f"after {row['real_steps']:,} real steps"
+    if not _is_missing(row.get("return_real")):
+        return f"return {_number(row['return_real'])} ± {_number(row.get('return_real_std'))} {after}"
+    if _has_no_environment(row):
+        return f"collected {_number(row.get('return_collected'))} {after}"
+    return (
+        f"no return {after}: the last evaluation failed, as the warning above says; "
+        f"where it fails: metrpo evaluate {shlex.quote(str(run_dir))}"
+    )
+
+
+def _has_no_environment(row: Row) -> bool:
+    """Only another program can play."""
+    return not row.get("failed_evaluation") and "return_imagined" in row
 
 
 def earned(row: Row) -> str:
@@ -237,12 +259,13 @@ def duration(seconds: float) -> str:
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
 
 
-def _resuming(where: str, iteration: int, of: int | None, real_steps: int) -> str:
+def _resuming(where: str, iteration: int, of: int | None, real_steps: int, waiting: int) -> str:
     steps = counted(real_steps, "real step")
     if of is not None and iteration > of:
         return f"{where} is finished: {counted(of, 'iteration')}, {steps}; a larger budget goes on"
     budget = "" if of is None else f" of {of}"
-    return f"resuming {where} at iteration {iteration}{budget}, {steps}"
+    collected = f" and {waiting:,} that wait" if waiting else ""
+    return f"resuming {where} at iteration {iteration}{budget}, {steps}{collected}"
 
 
 def _heading(iteration: int, of: int | None) -> str:

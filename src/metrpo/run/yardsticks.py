@@ -15,11 +15,19 @@ from metrpo.untrusted import json_of, text_of
 NAMES = {"zero": "doing nothing", "random": "random actions"}
 
 
-def keep(run_dir: Path, record: Mapping[str, Any]) -> None:
-    """Adds the record to run.json. Raises `RunDirectoryError` when it cannot be written."""
+def keep(run_dir: Path, task: str, record: Mapping[str, Any]) -> None:
+    """Adds the record of `task` to run.json. Raises `RunDirectoryError` when it cannot be written."""
     file = run_dir / "run.json"
     about = json_of(text_of(file, RunDirectoryError), f"{file} is damaged", RunDirectoryError)
-    atomic_write(file, json.dumps({**about, "yardsticks": record}, indent=2) + "\n")
+    atomic_write(file, json.dumps({**about, "yardsticks": {"task": task, **record}}, indent=2) + "\n")
+
+
+def are_kept(run_dir: Path, task: str) -> bool:
+    """Whether they have been measured: of this task, for a directory that lost nothing may be another's now."""
+    file = run_dir / "run.json"
+    about = json_of(text_of(file, RunDirectoryError), f"{file} is damaged", RunDirectoryError)
+    record = about.get("yardsticks")
+    return bool(kept(run_dir)) and record.get("task") == task
 
 
 def kept(run_dir: Path) -> dict[str, float]:

@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from metrpo import budget
+from metrpo.run.episodes import waiting_steps
 from metrpo.run.progress import duration
 from metrpo.seeing.health import examine
 from metrpo.seeing.runs import Found, SeenRun, find, is_finished, told_apart
@@ -32,7 +33,7 @@ _COLUMNS = (
 _SPARE = ("s/iteration", "best", "preset", "real steps", "gap", "left", "so far", "system", "changed", "seed", "run")
 """Columns that a narrow terminal goes without, first ones first."""
 _RECENT = 3
-"""Iterations whose mean duration says how long the next ones take: they grow with the data."""
+"""Iterations whose median duration says how long the next ones take: they grow with the data."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,9 @@ class Standing:
     iterations: int | None
     """About how many there will be."""
     real_steps: int
+    """Learned from."""
+    waiting_steps: int
+    """Collected, and not learned from yet."""
     return_real: float | None
     return_best: float | None
     gap: float | None
@@ -92,6 +96,7 @@ def standing(run: SeenRun, now: float | None = None, changed: Mapping[str, str] 
         iteration=iteration,
         iterations=total,
         real_steps=int(rows[-1]["real_steps"] or 0) if rows else 0,
+        waiting_steps=waiting_steps(run.path) if state != "finished" else 0,
         return_real=_plain(real[-1]) if rows else None,
         return_best=float(finite.max()) if len(finite) else None,
         gap=_plain(run.column("gap")[-1]) if rows else None,
@@ -231,7 +236,7 @@ def _cells(s: Standing) -> dict[str, tuple[str, str]]:
         "seed": (str(s.seed), ""),
         "changed": (", ".join(f"{name}={value}" for name, value in s.changed.items()), ""),
         "iteration": (f"{s.iteration}/{'?' if s.iterations is None else s.iterations}", ""),
-        "real steps": (f"{s.real_steps:,}", ""),
+        "real steps": (f"{s.real_steps:,}" + (f" +{s.waiting_steps:,}" if s.waiting_steps else ""), ""),
         "return": (f"{_number(s.return_collected)} collected" if is_robots else _number(s.return_real), "bold"),
         "best": (_number(s.return_best), ""),
         "gap": (_number(s.gap), ""),
@@ -251,10 +256,12 @@ def _total(run: SeenRun) -> int | None:
 
 
 def _seconds(run: SeenRun) -> float | None:
-    """Mean duration of the last iterations; None without a clock."""
+    """How long the next iteration takes, by the last ones; None without a clock."""
     wall = np.append(0.0, run.column("wall_seconds"))[-_RECENT - 1 :]
     steps = np.diff(wall)
-    return float(steps.mean()) if len(steps) and np.isfinite(steps).all() else None
+    if len(steps) == len(run.rows) > 1:
+        steps = steps[1:]  # the first one compiled
+    return float(np.median(steps)) if len(steps) and np.isfinite(steps).all() else None
 
 
 def _written(folder: Path) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import decimal
 import logging
 import numbers
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
@@ -69,14 +70,39 @@ def broken(
 
 @contextmanager
 def closing(env: Env, name: str) -> Iterator[Env]:
-    """Closes an environment after the block; one that cannot be closed costs a warning, for its work is done."""
+    """Closes an environment after the block; one that cannot be closed costs a warning, for its work is done.
+
+    Within `warning_once` it costs one for all.
+    """
     try:
         yield env
     finally:
         try:
             env.close()
         except Exception as error:
-            _log.warning("%s: close() raised %s: %s; nothing is lost by that", name, type(error).__name__, error)
+            text = f"{name}: close() raised {type(error).__name__}: {error}"
+            if _told is None or not _told[text]:
+                _log.warning("%s; nothing is lost by that", text)
+            if _told is not None:
+                _told[text] += 1
+
+
+_told: Counter[str] | None = None
+"""How often a warning was due since `warning_once` began."""
+
+
+@contextmanager
+def warning_once() -> Iterator[None]:
+    """Every warning of `closing` is given once in this block, and counted at its end."""
+    global _told
+    _told, before = Counter(), _told
+    try:
+        yield
+    finally:
+        for text, times in _told.items():
+            if times > 1:
+                _log.warning("%s, %d times in all", text, times)
+        _told = before
 
 
 def _call(name: str, what: str, call: Callable[[], Any]) -> Any:
