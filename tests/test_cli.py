@@ -104,6 +104,16 @@ def test_the_same_command_goes_on_and_a_larger_budget_too(capsys):
     assert [row["iteration"] for row in metrpo.read_metrics("a/metrics.csv")] == [1, 2, 3]
 
 
+def test_a_video_is_made_again_only_for_another_policy(capsys, monkeypatch):
+    made = []
+    write = lambda make_env, policy, path, seed: (made.append(1), path.write_text("video"), path)[-1]  # noqa: E731
+    monkeypatch.setattr("metrpo.evaluation.record", write)
+    for iterations, videos in ((1, 1), (1, 1), (2, 2)):
+        assert run("train", "Swimmer", "--iterations", str(iterations), "--run-dir", "a") == 0
+        assert len(made) == videos
+        assert "a/video.mp4" in capsys.readouterr().out
+
+
 TEN = ["--ensemble.members", "10"]
 
 
