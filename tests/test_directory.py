@@ -335,6 +335,9 @@ def test_a_finished_run_started_again_writes_only_what_is_missing(tmp_path, monk
     assert load_policy(tmp_path).info.iteration == 2
     changed = {name for name, time in times().items() if before[name] != time}
     assert changed == {str(tmp_path / name) for name in ("curve.png", "policy.json", "policy.npz")}
+    (tmp_path / "policy.json").unlink()
+    train(tmp_path, until=2)
+    assert (tmp_path / "policy.json").exists(), "also where it alone is missing"
 
 
 def test_a_curve_from_before_the_checkpoint_is_drawn_anew(tmp_path, monkeypatch):

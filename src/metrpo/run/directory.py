@@ -47,7 +47,7 @@ from metrpo.run.metrics import (
     to_csv,
     without_clocks,
 )
-from metrpo.run.policy_file import Interface, Weights, load_policy, save_policy
+from metrpo.run.policy_file import Interface, Weights, has_policy, save_policy
 from metrpo.run.report import draw_curve
 from metrpo.untrusted import text_of
 from metrpo.world.registry import get_task
@@ -246,11 +246,8 @@ class RunDirectory:
     def _has(self, name: str) -> bool:
         """Whether there is such a file, sound and no older than the checkpoint that it derives from."""
         checkpoint = self._checkpoints()[-1].stat().st_mtime_ns
-        with contextlib.suppress(RunDirectoryError):
-            if name == "policy.npz":
-                load_policy(self.path)
-            return any(path.stat().st_mtime_ns >= checkpoint for path in self.path.glob(name))
-        return False
+        sound = name != "policy.npz" or has_policy(self.path)
+        return sound and any(path.stat().st_mtime_ns >= checkpoint for path in self.path.glob(name))
 
     def _write_policy(self, state: Saved) -> None:
         result = self.rows[-1].get("return_real") if self.rows else None
