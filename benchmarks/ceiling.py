@@ -27,7 +27,7 @@ import numpy as np
 
 from metrpo import get_task
 from metrpo.run.files import source_commit
-from metrpo.world import together
+from metrpo.world import batch_episodes
 from metrpo.world.open_loop import OpenLoop
 from metrpo.world.task import Task
 
@@ -106,7 +106,7 @@ def best_plan(
 
 def played(task: Task, plan: np.ndarray, seed: int) -> float:
     """The plan's return in the environment itself."""
-    episode = together.play(task, lambda states, numbers, steps: plan[steps], iter([seed]))[0]
+    episode = batch_episodes.play(task, lambda states, numbers, steps: plan[steps], iter([seed]))[0]
     return float(episode.rewards.sum(dtype=np.float64))
 
 
@@ -118,7 +118,7 @@ def idle(task: Task, random: bool) -> dict[str, float]:
         shape = (len(states), task.action_size)
         return rng.uniform(-1, 1, shape) if random else np.zeros(shape)
 
-    returns = [e.rewards.sum(dtype=np.float64) for e in together.play(task, act, iter(range(1000, 1020)))]
+    returns = [e.rewards.sum(dtype=np.float64) for e in batch_episodes.play(task, act, iter(range(1000, 1020)))]
     return {"mean": float(np.mean(returns)), "sd": float(np.std(returns, ddof=1))}
 
 

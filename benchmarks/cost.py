@@ -23,11 +23,12 @@ import jax  # noqa: E402 (the environment must stand first)
 import numpy as np  # noqa: E402
 from matplotlib.figure import Figure  # noqa: E402
 
-from metrpo import get_task, phase, preset  # noqa: E402
+from metrpo import get_task, policy_phase, preset  # noqa: E402
 from metrpo.model import ensemble as ensembles  # noqa: E402
 from metrpo.model.fit import fit  # noqa: E402
-from metrpo.policy import advantage, gaussian  # noqa: E402
-from metrpo.policy.improve import init_memory  # noqa: E402
+from metrpo.policy import gaussian  # noqa: E402
+from metrpo.policy.improvers.table import init_memory  # noqa: E402
+from metrpo.policy.value import linear  # noqa: E402
 from metrpo.presets import override  # noqa: E402
 from metrpo.types import Transitions  # noqa: E402
 
@@ -59,9 +60,9 @@ def cost(transitions: int, models: int, width: int, horizon: int, repeats: int =
     passes = -(-STEPS // per_pass)
     settings = dataclasses.replace(config.fit, max_passes=passes, patience=passes, validate_every=min(5, passes))
     policy = gaussian.init(jax.random.key(1), task.state_size, task.action_size, config.policy.hidden, 1.0)
-    memory = init_memory(config, policy, advantage.init_baseline(task.state_size))
+    memory = init_memory(config, policy, linear.init(task.state_size))
     pool = np.asarray(0.1 * train.states[:1000])
-    starts = pool[rng.integers(len(pool), size=(5, phase.rollouts(config, task)))]
+    starts = pool[rng.integers(len(pool), size=(5, policy_phase.rollouts(config, task)))]
     seconds: dict[str, list[float]] = {"fit": [], "improve": []}
     for _ in range(repeats + 1):
         start = time.perf_counter()
@@ -70,8 +71,8 @@ def cost(transitions: int, models: int, width: int, horizon: int, repeats: int =
         # Whole passes only: brought to the same number of steps.
         seconds["fit"].append((time.perf_counter() - start) * STEPS / (info.passes * per_pass))
         start = time.perf_counter()
-        jax.block_until_ready(phase._updates(task, config, ensemble, policy, memory, starts, jax.random.key(2)))
-        phase.values_of(task, ensemble, policy, pool[: config.validate.starts])
+        jax.block_until_ready(policy_phase._updates(task, config, ensemble, policy, memory, starts, jax.random.key(2)))
+        policy_phase.values_of(task, ensemble, policy, pool[: config.validate.starts])
         seconds["improve"].append(time.perf_counter() - start)
     return {name: statistics.median(values[1:]) for name, values in seconds.items()}
 

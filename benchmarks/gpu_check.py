@@ -50,9 +50,9 @@ Save = Callable[[dict[str, Any]], None]
 def stages(task: str, name: str, tiny: bool, seconds: float, save: Save) -> None:
     """Whole outer iterations of a preset, each with its seconds per stage, as many as there is time for."""
     from metrpo import algorithm
-    from metrpo.bench.report import compilations
+    from metrpo.console.progress import PlainProgress
     from metrpo.presets import override, preset
-    from metrpo.run.progress import PlainProgress
+    from metrpo.speed.measure import compilations
 
     end, rows = time.monotonic() + seconds, []
     cuts = TINY_CUTS if tiny else CUTS[name]
@@ -82,8 +82,8 @@ def bench(tiny: bool, seconds: float, save: Save) -> None:
     """`metrpo bench` without peers, and variants that a GPU may want: TF32, and TRPO's batch in one piece."""
     import jax
 
-    from metrpo.bench import ours, report
-    from metrpo.policy import linearised
+    from metrpo.policy.improvers import linearised
+    from metrpo.speed import measure, ours
 
     def in_one_piece() -> ours.Work:
         was = linearised.CHUNK
@@ -109,8 +109,8 @@ def bench(tiny: bool, seconds: float, save: Save) -> None:
     def tell() -> None:
         complete = {key: values for key, values in taken.items() if len(values) == max(map(len, taken.values()))}
         known = {k: w._replace(bound=w.bound if (w.bound, "metrpo") in complete else None) for k, w in works.items()}
-        timings = [report._timing(key, "metrpo", v, known, complete) for (key, _), v in complete.items()]
-        save({"text": report.Report({}, timings).text(), **report.Report(report._machine(), timings).record()})
+        timings = [measure._timing(key, "metrpo", v, known, complete) for (key, _), v in complete.items()]
+        save({"text": measure.Report({}, timings).text(), **measure.Report(measure._machine(), timings).record()})
 
     def turn(key: str) -> None:
         precision = makers[key][1]
@@ -119,7 +119,7 @@ def bench(tiny: bool, seconds: float, save: Save) -> None:
                 start = time.monotonic()
                 works[key] = makers[key][0]()
                 preparing[key] = time.monotonic() - start
-            taken.setdefault((key, "metrpo"), []).append(report._turn(works[key].run))
+            taken.setdefault((key, "metrpo"), []).append(measure._turn(works[key].run))
 
     for number in range(1 if tiny else ROUNDS):
         for key in makers:

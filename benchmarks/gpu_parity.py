@@ -23,15 +23,16 @@ import jax
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from metrpo import get_task, phase
+from metrpo import get_task, policy_phase
 from metrpo.config import FitConfig, TRPOConfig
 from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Ensemble
+from metrpo.model.epochs import validation_loss
 from metrpo.model.fit import fit
 from metrpo.model.imagine import imagine
-from metrpo.model.passes import validation_loss
-from metrpo.policy import gaussian, trpo
-from metrpo.policy.batch import Batch
+from metrpo.policy import gaussian
+from metrpo.policy.improvers import trpo
+from metrpo.policy.improvers.batch import Batch
 from metrpo.types import Transitions
 
 FACTOR, LEAST, CEILING = 10.0, 1e-5, 2e-2
@@ -107,7 +108,7 @@ def _imagine(task: Any, ensemble: Ensemble, policy: gaussian.Policy, starts: np.
         return imagine(ensemble, act, task.reward, task.terminated, starts, task.horizon, key)
 
     trajectories, _ = jax.jit(rollouts)(ensemble, policy, starts, jax.random.key(1))
-    values = phase.values_of(task, ensemble, policy, starts)
+    values = policy_phase.values_of(task, ensemble, policy, starts)
     states = np.asarray(trajectories.states)
     # Changes of state, for the states themselves would hide small ones.
     moved = states - starts

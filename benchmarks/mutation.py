@@ -58,9 +58,9 @@ ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "results" / "mutation"
 LEARNED = "tests/test_environments.py::test_the_dataset_holds_reward_and_end_where_they_are_learned"
 MODULES = {
-    "trpo": ("src/metrpo/policy/trpo.py", ["tests/test_trpo.py"]),
+    "trpo": ("src/metrpo/policy/improvers/trpo.py", ["tests/test_trpo.py"]),
     "advantage": ("src/metrpo/policy/advantage.py", ["tests/test_advantage.py"]),
-    "validate": ("src/metrpo/policy/validate.py", ["tests/test_validate.py"]),
+    "validate": ("src/metrpo/policy/stopping.py", ["tests/test_validate.py"]),
     "dataset": ("src/metrpo/world/dataset.py", ["tests/test_dataset.py", LEARNED]),
     "checkpoint": ("src/metrpo/run/checkpoint.py", ["tests/test_checkpoint.py"]),
 }

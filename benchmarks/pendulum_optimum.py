@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from metrpo.evaluation import evaluate
-from metrpo.world.mbbl import MAX_TORQUE, pendulum_reward
+from metrpo.world.tasks.mbbl import MAX_TORQUE, pendulum_reward
 
 TASK = "mbbl/Pendulum"
 ANGLES, RATES, TORQUES, HORIZON, FASTEST = 361, 257, 21, 200, 8.0

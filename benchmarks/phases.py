@@ -17,16 +17,16 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from metrpo import algorithm, config, phase
+from metrpo import algorithm, config, policy_phase
 from metrpo.config import Config
+from metrpo.console.progress import SILENT
 from metrpo.model import ensemble as ensembles
 from metrpo.model.diagnostics import diagnose
 from metrpo.model.ensemble import Ensemble
-from metrpo.policy.improve import init_baseline
+from metrpo.policy.improvers.table import init_baseline
 from metrpo.presets import override
 from metrpo.run.clock import Clock
 from metrpo.run.directory import RunDirectory
-from metrpo.run.progress import SILENT
 from metrpo.seeds import Stage, key_of
 
 
@@ -66,7 +66,7 @@ def phases(config: Config, state: algorithm.State, count: int, fresh: bool, vari
         policy, baseline, info = algorithm._improve(config, task, state, data, ensemble, number, SILENT, Clock())
         state = state._replace(policy=policy, baseline=baseline)
         earned = float(np.mean(algorithm.evaluate(config, task, policy, number, origin=state.origin)))
-        horizon, key = phase.imagined_horizon(config, task), jax.random.key(seed)
+        horizon, key = policy_phase.imagined_horizon(config, task), jax.random.key(seed)
         saturated = diagnose(ensemble, policy, data.validation, data.train, horizon, key).saturated
         std = float(np.mean(np.exp(np.asarray(policy.log_std))))
         print(

@@ -3,8 +3,8 @@
     taskset -c 0 python benchmarks/real_steps.py
 
 plays the paper's tasks with a fresh policy (32-32) by `metrpo.world.collect.evaluate` and by
-`metrpo.world.together.evaluate`, in turns; medians of five. Time is the process's own, so that others on the core count
-little, and threads add up: pin it to one core.
+`metrpo.world.batch_episodes.evaluate`, in turns; medians of five. Time is the process's own, so that
+others on the core count little, and threads add up: pin it to one core.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from metrpo import get_task
 from metrpo.policy import gaussian
-from metrpo.world import collect, together
+from metrpo.world import batch_episodes, collect
 
 EPISODES = {"Swimmer": 20, "Snake": 20, "Hopper": 64, "HalfCheetah": 64, "Ant": 64, "Humanoid": 20}
 
@@ -30,11 +30,11 @@ def main() -> None:
         fresh = gaussian.init(jax.random.key(0), task.state_size, task.action_size, (32, 32), 1.0)
         act = partial(gaussian.mean, jax.tree.map(np.asarray, fresh))
         seeds = map(collect.seed_of, [np.random.default_rng(0)] * episodes)
-        played = together.play(task, lambda states, numbers, steps: act(states), seeds)  # noqa: B023
+        played = batch_episodes.play(task, lambda states, numbers, steps: act(states), seeds)  # noqa: B023
         steps = sum(len(e.rewards) for e in played)
         rates: dict[str, list[float]] = {"one": [], "many": []}
         for _ in range(5):
-            for kind, play in (("one", collect.evaluate), ("many", together.evaluate)):
+            for kind, play in (("one", collect.evaluate), ("many", batch_episodes.evaluate)):
                 start = time.process_time()
                 play(task, act, episodes, 0)
                 rates[kind].append(steps / (time.process_time() - start))

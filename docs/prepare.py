@@ -139,8 +139,8 @@ def check() -> Links:
 
 def commands() -> str:
     """All commands in short, and a section for each: what --help-all prints, without its boxes."""
-    from metrpo import options
-    from metrpo.helptext import overview
+    from metrpo.commands import options
+    from metrpo.commands.help import overview
 
     names = [command.__name__.lower() for command in typing.get_args(options.Command)]
     sections = (_command(name, _help(options.parse, name)) for name in names)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from helpers import on_host
 from metrpo.policy import advantage
+from metrpo.policy.value import linear
 from metrpo.types import Trajectories
 
 T, N, S = 12, 5, 3
@@ -18,9 +19,9 @@ discounted_returns, gae, standardise, features, fit_baseline, advantages_and_bas
         advantage.discounted_returns,
         advantage.gae,
         advantage.standardise,
-        advantage.features,
-        advantage.fit_baseline,
-        advantage.advantages_and_baseline,
+        linear.features,
+        linear.fit,
+        linear.advantages_and_value,
     )
 )
 seeds = st.integers(0, 2**31 - 1)
@@ -219,8 +220,8 @@ def test_masked_steps_have_no_influence():
 
 
 def test_the_first_baseline_predicts_zero():
-    assert advantage.init_baseline(S).shape == (2 * S + 4,)
-    assert not np.any(advantage.init_baseline(S))
+    assert linear.init(S).shape == (2 * S + 4,)
+    assert not np.any(linear.init(S))
 
 
 # ---------------------------------------------------------------- episodes that are cut off
@@ -244,7 +245,7 @@ def test_the_value_at_the_cut_is_that_of_the_endless_episode():
     states = rng.normal(size=(6, 40, 2)).astype(np.float32)
     ones = np.ones((5, 40), np.float32)
     endless = Trajectories(states[:5], np.zeros((5, 40, 1), np.float32), ones, ones, states[5], ones[0])
-    cut = on_host(static_argnames="cut")(advantage.advantages_and_baseline)
+    cut = on_host(static_argnames="cut")(linear.advantages_and_value)
     baseline = np.zeros(8, np.float32)
     for _ in range(60):
         _, baseline = cut(endless, baseline, discount, 1.0, 1e-5, cut=True)
@@ -261,6 +262,6 @@ def test_the_value_at_the_cut_is_that_of_the_endless_episode():
 def test_without_time_states_alone_make_the_features():
     states = np.random.default_rng(0).normal(size=(4, 3, 2)).astype(np.float32)
     with_time = features(states)
-    timeless = on_host(static_argnames="timeless")(advantage.features)(states, timeless=True)
+    timeless = on_host(static_argnames="timeless")(linear.features)(states, timeless=True)
     np.testing.assert_array_equal(timeless[..., 4:7], 0)
     np.testing.assert_array_equal(np.delete(timeless, range(4, 7), -1), np.delete(with_time, range(4, 7), -1))

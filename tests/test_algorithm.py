@@ -14,17 +14,19 @@ import pytest
 
 import probe
 from helpers import linear_ensemble, random_ensemble, random_policy, slow_mean
-from metrpo import algorithm, phase, training
-from metrpo.bench.report import compilations
+from metrpo import algorithm, policy_phase, training
 from metrpo.config import Config
+from metrpo.console.progress import SILENT, Progress
 from metrpo.model.imagine import ImagineInfo, imagine
-from metrpo.policy import advantage, gaussian, trpo
-from metrpo.policy.batch import Batch, ImproveInfo
-from metrpo.policy.improve import Memory
+from metrpo.policy import gaussian
+from metrpo.policy.improvers import trpo
+from metrpo.policy.improvers.batch import Batch, ImproveInfo
+from metrpo.policy.improvers.table import Memory
 from metrpo.policy.inputs import folded, inputs_of, normalised
+from metrpo.policy.value import linear
 from metrpo.presets import override, preset
 from metrpo.run import clock as clock_module
-from metrpo.run.progress import SILENT, Progress
+from metrpo.speed.measure import compilations
 
 TINY = override(
     Config(task="Probe", iterations=4, evaluation_episodes=2),
@@ -347,8 +349,8 @@ class Script:
 
     def __init__(self, monkeypatch, tiny, values, **settings):
         self.values, self.blocks, self.fixed_starts, self.starts = values, [], [], []
-        monkeypatch.setattr(phase, "_updates", self._updates)
-        monkeypatch.setattr(phase, "values_of", self._validate)
+        monkeypatch.setattr(policy_phase, "_updates", self._updates)
+        monkeypatch.setattr(policy_phase, "values_of", self._validate)
         self.state = tiny.states[2]._replace(baseline=np.zeros(8, np.float32))
         layers = ((np.zeros((2, 2), np.float32), np.zeros(2, np.float32)),)
         self.state = self.state._replace(policy=gaussian.Policy(layers, np.full(2, -3.0, np.float32)))
@@ -481,7 +483,7 @@ def test_where_episodes_are_cut_both_policies_are_held_against_the_same_value(ti
         asked.append((script.number(policy), float(np.asarray(baseline)[0])))
         return script._validate(task, ensemble, policy, starts, config, inputs, baseline)
 
-    monkeypatch.setattr(phase, "values_of", value)
+    monkeypatch.setattr(policy_phase, "values_of", value)
     short = {"imagine.horizon": 5, "advantage.discount": 0.9, "validate.patience": 10}
     _, _, info = script.run(override(script.config, short))
     assert asked == [(0, 0), (5, 5), (0, 5), (10, 10), (5, 10), (15, 15), (5, 15)]
@@ -512,7 +514,9 @@ def test_the_oracle_plays_other_starts_than_the_record(tiny, monkeypatch):
 def test_a_phase_on_normalised_states_begins_with_the_same_policy(tiny, monkeypatch):
     config, ensemble = override(TINY, {"policy.normalise": True}), random_ensemble(0, 2, 2, 2)
     state, seen = tiny.states[2], []
-    monkeypatch.setattr(phase, "values_of", lambda task, ensemble, policy, *rest: seen.append((policy, rest)) or [0.0])
+    monkeypatch.setattr(
+        policy_phase, "values_of", lambda task, ensemble, policy, *rest: seen.append((policy, rest)) or [0.0]
+    )
     policy, *_ = algorithm._improve(config, probe.PROBE, state, state.dataset, ensemble, 3, SILENT, algorithm.Clock())
     (inside, (_, _, inputs, _)), *_ = seen
     rows = state.dataset.train.states
@@ -584,7 +588,7 @@ def test_starts_may_be_fresh_resets_instead(tiny, monkeypatch):
 @pytest.mark.parametrize(("steps", "horizon", "rollouts"), [(100, 20, 5), (101, 20, 6), (1, 20, 1), (50_000, 200, 250)])
 def test_enough_rollouts_for_the_imagined_steps(steps, horizon, rollouts):
     task = types.SimpleNamespace(horizon=horizon)
-    assert phase.rollouts(override(TINY, {"imagine.steps": steps}), task) == rollouts
+    assert policy_phase.rollouts(override(TINY, {"imagine.steps": steps}), task) == rollouts
 
 
 def test_a_block_of_updates_is_imagination_advantages_and_trpo_one_after_the_other(tiny):
@@ -594,8 +598,8 @@ def test_a_block_of_updates_is_imagination_advantages_and_trpo_one_after_the_oth
     ensemble = linear_ensemble([(probe.A, probe.B), (0.9 * probe.A, probe.B)])
     policy = jax.tree.map(jnp.asarray, random_policy(0, 2, 2, hidden=(4,), std=0.5))
     starts = np.random.default_rng(0).uniform(-0.7, 0.7, (2, 5, 2)).astype(np.float32)
-    baseline, key = advantage.init_baseline(2) - 0.1, jax.random.key(3)
-    got_policy, (got_baseline, _), (improved, imagined) = phase._updates(
+    baseline, key = linear.init(2) - 0.1, jax.random.key(3)
+    got_policy, (got_baseline, _), (improved, imagined) = policy_phase._updates(
         probe.PROBE, config, ensemble, policy, Memory(baseline, ()), starts, key
     )
 
@@ -603,11 +607,11 @@ def test_a_block_of_updates_is_imagination_advantages_and_trpo_one_after_the_oth
     def one(policy, baseline, starts, key):
         act = partial(gaussian.sample, policy)
         t, info = imagine(ensemble, act, probe.reward, None, starts, probe.HORIZON, key)
-        advantages, baseline = advantage.advantages_and_baseline(t, baseline, 1.0, 1.0, 1e-5)
+        advantages, baseline = linear.advantages_and_value(t, baseline, 1.0, 1.0, 1e-5)
         batch = Batch(t.states, t.actions, advantages, t.mask)
         batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(100, *x.shape[2:]), batch)
         policy, improve_info = trpo.improve(policy, batch, config.trpo)
-        return policy, baseline, improve_info, info, advantage.features(t.states)
+        return policy, baseline, improve_info, info, linear.features(t.states)
 
     for i, k in enumerate(jax.random.split(key, 2)):
         mine = jax.random.fold_in(k, 0)  # the first device's

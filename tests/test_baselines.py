@@ -14,12 +14,12 @@ from scipy import stats
 import probe
 from helpers import linear_ensemble, random_ensemble, random_episode, random_policy, slow_delta, slow_mean
 from metrpo import training
-from metrpo.baselines import model_free, on_policy, svg
+from metrpo.baselines import on_policy, real_trpo, value_gradients
 from metrpo.baselines.on_policy import Drawn
 from metrpo.config import Config
+from metrpo.console.progress import Progress
 from metrpo.policy.gaussian import Policy
 from metrpo.presets import override
-from metrpo.run.progress import Progress
 
 BASE = override(
     Config(task="Probe", evaluation_episodes=10),
@@ -76,7 +76,7 @@ def test_episodes_lie_side_by_side_and_end_where_they_ended():
     rng = np.random.default_rng(0)
     episodes = [random_episode(rng, length, terminated=length < 7) for length in (7, 3, 5)]
     actions = [rng.normal(size=(len(e.rewards), 2)).astype(np.float32) for e in episodes]
-    t = model_free.trajectories(Drawn(episodes, actions), 7)
+    t = real_trpo.trajectories(Drawn(episodes, actions), 7)
     assert t.states.shape == (7, 64, 4), "padded to a fixed number of episodes"
     np.testing.assert_array_equal(t.mask.sum(0), [7, 3, 5, *[0] * 61])
     for i, (episode, drawn) in enumerate(zip(episodes, actions, strict=True)):
@@ -137,7 +137,7 @@ def path_of(rng, weights, bias, std, steps, start=None):
     drawn, states = np.array(drawn), np.array(states)
     assert np.abs(drawn).max() < 1
     rewards = probe.reward(states[:-1], drawn, states[1:])
-    path = svg.Path(states, drawn, rewards, np.ones(steps))
+    path = value_gradients.Path(states, drawn, rewards, np.ones(steps))
     return jax.tree.map(lambda x: np.asarray(x, np.float32), path), noise
 
 
@@ -183,7 +183,7 @@ def test_svg_inf_is_the_gradient_of_the_real_paths_return(wrong_by, discount):
     model = linear_ensemble([(probe.A, probe.B)])
     *inner, (weights, biases) = model.networks
     model = model._replace(networks=(*inner, (weights, biases + np.float32(wrong_by))))
-    got = svg.value_gradient(probe.PROBE, model, linear_policy(WEIGHTS, BIAS, STD), path, discount)
+    got = value_gradients.value_gradient(probe.PROBE, model, linear_policy(WEIGHTS, BIAS, STD), path, discount)
 
     def value(weights, bias, log_std):
         return realised(weights, bias, np.exp(log_std), noise, path.states[0], discount)
@@ -212,7 +212,10 @@ def test_svg_inf_is_on_average_the_exact_policy_gradient():
     paths = [path_of(rng, WEIGHTS, BIAS, STD, steps, start)[0] for _ in range(count)]
     stacked = jax.tree.map(lambda *x: np.stack(x), *paths)
     gradient = partial(
-        svg.value_gradient, probe.PROBE, linear_ensemble([(probe.A, probe.B)]), linear_policy(WEIGHTS, BIAS, STD)
+        value_gradients.value_gradient,
+        probe.PROBE,
+        linear_ensemble([(probe.A, probe.B)]),
+        linear_policy(WEIGHTS, BIAS, STD),
     )
     got = jax.jit(jax.vmap(lambda path: gradient(path, 1.0)))(stacked)
     expected = differences(
@@ -231,7 +234,7 @@ def test_svg_1_is_the_gradient_of_one_step_and_the_value_after_it():
     model = random_ensemble(3, members=1, state_size=2, action_size=2, scale=0.5)
     value, discount = random_policy(4, 3, 1), 0.9
     policy = linear_policy(WEIGHTS, BIAS, STD)
-    got = jax.jit(partial(svg.value_gradient, probe.PROBE))(model, policy, path, discount, value)
+    got = jax.jit(partial(value_gradients.value_gradient, probe.PROBE))(model, policy, path, discount, value)
     states = np.asarray(path.states, np.float64)
     residuals = [
         states[t + 1] - states[t] - slow_delta(model, 0, states[t], np.asarray(path.drawn[t], np.float64))
@@ -257,11 +260,11 @@ def test_svg_1_is_the_gradient_of_one_step_and_the_value_after_it():
 @pytest.mark.parametrize("value", [None, random_policy(4, 3, 1)], ids=["inf", "1"])
 def test_what_follows_the_end_of_a_path_counts_nothing(value):
     path, _ = path_of(np.random.default_rng(5), WEIGHTS, BIAS, STD, 6)
-    padded = svg._path(path.states, path.drawn, path.rewards, 11)
+    padded = value_gradients._path(path.states, path.drawn, path.rewards, 11)
     garbage = padded._replace(drawn=padded.drawn.copy())
     garbage.drawn[6:] = 0.7
     model, policy = random_ensemble(3, members=1, state_size=2, action_size=2), linear_policy(WEIGHTS, BIAS, STD)
-    gradient = jax.jit(lambda p: svg.value_gradient(probe.PROBE, model, policy, p, 1.0, value))
+    gradient = jax.jit(lambda p: value_gradients.value_gradient(probe.PROBE, model, policy, p, 1.0, value))
     expected = gradient(path)
     for got in (gradient(padded), gradient(garbage)):
         for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
@@ -272,11 +275,13 @@ def test_the_value_network_learns_the_returns_to_go():
     rng = np.random.default_rng(6)
     path, _ = path_of(rng, WEIGHTS, BIAS, STD, 12, np.array([0.3, 0.3]))
     config = override(SVG, {"svg.value_steps": 4000, "svg.horizon": "1"})
-    state = svg.init(config)
+    state = value_gradients.init(config)
     normaliser = random_ensemble(0, members=1, state_size=2, action_size=2).normaliser
-    value, _ = jax.jit(svg._train_value, static_argnums=0)(config, normaliser, state.value, state.value_moments, path)
+    value, _ = jax.jit(value_gradients._train_value, static_argnums=0)(
+        config, normaliser, state.value, state.value_moments, path
+    )
     to_go = np.cumsum(path.rewards[::-1])[::-1]
-    got = svg._value(value, normaliser, path.states[:-1], jnp.arange(12))
+    got = value_gradients._value(value, normaliser, path.states[:-1], jnp.arange(12))
     np.testing.assert_allclose(got, to_go, atol=0.05)
 
 

@@ -6,9 +6,9 @@ import json
 
 import pytest
 
-from metrpo.bench import ours, peers, report
-from metrpo.cli import main
+from metrpo.commands.main import main
 from metrpo.presets import override, preset
+from metrpo.speed import measure, ours, peers
 
 
 def test_operations_are_those_of_the_layers():
@@ -20,9 +20,9 @@ def test_every_work_of_a_peer_has_a_counterpart():
     works = ours.works()
     for offered in peers.WORK.values():
         for theirs in offered:
-            assert report._counterpart(theirs, works) in works
-    assert report._counterpart("fit-1024-bfloat16", works) == "fit-1024-bfloat16"
-    assert report._counterpart("trpo-value", works) == "trpo"
+            assert measure._counterpart(theirs, works) in works
+    assert measure._counterpart("fit-1024-bfloat16", works) == "fit-1024-bfloat16"
+    assert measure._counterpart("trpo-value", works) == "trpo"
 
 
 class FakeWorker:
@@ -64,7 +64,7 @@ def fake(monkeypatch):
         "fit-1024": lambda: ours.Work(scripted("fit-1024", [2.0, 4.0, 8.0]), 4e9, "products", 100.0),
     }
     monkeypatch.setattr(ours, "works", lambda: table)
-    monkeypatch.setattr(report, "TURN", 0.0)
+    monkeypatch.setattr(measure, "TURN", 0.0)
     monkeypatch.setattr(peers, "WORK", {"slowlib": ("fit-1024",)})
     monkeypatch.setattr(peers, "PEERS", ("slowlib",))
     monkeypatch.setattr(peers, "Worker", FakeWorker)
@@ -78,19 +78,19 @@ def fake(monkeypatch):
 )
 def test_short_work_is_repeated_and_its_first_repetition_not_counted(takes, expected, repetitions, monkeypatch):
     clock, done = [0.0], []
-    monkeypatch.setattr(report.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(measure.time, "perf_counter", lambda: clock[0])
 
     def run():
         done.append(takes[len(done)])
         clock[0] += done[-1]
         return done[-1]
 
-    assert report._turn(run) == pytest.approx(expected)
+    assert measure._turn(run) == pytest.approx(expected)
     assert len(done) == repetitions
 
 
 def test_shares_and_ratios_are_taken_within_a_round(fake):
-    measured = report.bench(True, 3, False)
+    measured = measure.bench(True, 3, False)
     rate, mine, theirs = measured.timings
     assert ORDER[:3] == ["products", "fit-1024", "slowlib fit-1024"]
     assert len(ORDER) == 9
@@ -138,12 +138,12 @@ def test_whole_iterations_are_timed_and_their_compilations_counted(monkeypatch):
         "evaluation_episodes": 1,
     }
     monkeypatch.setattr(ours, "small_iteration", lambda: override(preset("Swimmer"), small))
-    monkeypatch.setattr(report, "_start_to_imagined", lambda: 1.5)
-    measured = report._iterations(lambda text: None)
+    monkeypatch.setattr(measure, "_start_to_imagined", lambda: 1.5)
+    measured = measure._iterations(lambda text: None)
     assert len(measured.seconds) == 3
     assert measured.compilations[0] > 5
     assert measured.compilations[2] == 0
     assert all(0 < share < 1 for share in measured.outside)
-    text = report.Report({}, [], measured).text()
+    text = measure.Report({}, [], measured).text()
     assert "compilations: " in text
     assert "compile cache warm: 1.5 s" in text

@@ -6,10 +6,10 @@ import pytest
 
 import probe
 from metrpo.errors import ConfigError
-from metrpo.memory import require_memory
+from metrpo.external import begin
 from metrpo.presets import preset
 from metrpo.run import machine
-from metrpo.stepwise import begin
+from metrpo.run.memory import require_memory
 from metrpo.training import init
 from metrpo.world.registry import tasks
 

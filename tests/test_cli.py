@@ -16,14 +16,14 @@ import numpy as np
 import pytest
 
 import metrpo
-from metrpo import cli
-from metrpo.cli import main
+from metrpo.commands import main as commands
+from metrpo.commands.default_dir import default_run_dir
+from metrpo.commands.main import main
+from metrpo.commands.options import COMMANDS, parse
 from metrpo.config import Config
-from metrpo.default_dir import default_run_dir
-from metrpo.experiments.figures import Run
-from metrpo.options import COMMANDS, parse
+from metrpo.launch.run_spec import RunSpec
 from metrpo.presets import preset
-from metrpo.run import directory, doctor, machine, video
+from metrpo.run import directory, installation, machine, video
 from metrpo.run.directory import RunDirectory
 from metrpo.run.policy_file import load_policy
 from metrpo.run.video import VideoError
@@ -144,7 +144,7 @@ def test_other_settings_have_another_directory_and_the_same_command_the_same(cap
     ],
 )
 def test_the_default_directory_is_named_after_what_is_changed(options, name):
-    config, path = cli._run(parse(["train", "Swimmer", *options]))
+    config, path = commands._run(parse(["train", "Swimmer", *options]))
     assert (path.name == f"Swimmer-fast-seed0{name}") or path.name == name or "settings" in name
     if "settings" in name:
         assert re.fullmatch(r"Swimmer-fast-seed1-4-settings-[0-9a-f]{8}", path.name)
@@ -333,7 +333,7 @@ def test_tasks_lists_them(capsys):
 
 
 def test_doctor_finds_what_is_here_and_what_is_missing(capsys, monkeypatch):
-    monkeypatch.setattr(doctor.video, "gl_backend", lambda: None)
+    monkeypatch.setattr(installation.video, "gl_backend", lambda: None)
     assert run("doctor", "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["versions"]["jax"]
@@ -411,8 +411,8 @@ def test_a_setting_that_is_on_or_off_has_both_forms_whatever_the_preset(capsys, 
 def test_the_command_of_a_run_sets_what_is_on_or_off():
     """Sweeps and searches give it to `metrpo train`."""
     for value, preset_ in ((True, "paper"), (False, "fast")):
-        changed = Run("Swimmer", "me-trpo", 0, (("policy.normalise", value), ("deterministic", True)), preset_, "")
-        config, _ = cli._run(parse(["train", *changed.arguments]))
+        changed = RunSpec("Swimmer", "me-trpo", 0, (("policy.normalise", value), ("deterministic", True)), preset_, "")
+        config, _ = commands._run(parse(["train", *changed.arguments]))
         assert config == changed.config
 
 
@@ -452,7 +452,7 @@ def test_version_and_no_arguments(capsys):
 
 
 def test_help_comes_without_jax_and_mujoco():
-    code = "import sys; from metrpo.cli import main; main(['--help']); main(['evaluate', '--help']); "
+    code = "import sys; from metrpo.commands.main import main; main(['--help']); main(['evaluate', '--help']); "
     code += "print([m for m in ('jax', 'mujoco', 'gymnasium', 'numpy') if m in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.splitlines()[-1] == "[]"
@@ -549,7 +549,7 @@ def test_doctor_names_a_platform_that_jax_cannot_use(capsys, monkeypatch):
     def unusable() -> list[str]:
         raise metrpo.MetrpoError("JAX_PLATFORMS=tpu: JAX cannot use it (none)")
 
-    monkeypatch.setattr(doctor, "device_names", unusable)
+    monkeypatch.setattr(installation, "device_names", unusable)
     monkeypatch.setenv("JAX_PLATFORMS", "tpu")
     assert run("doctor") == 1
     assert "problem: JAX_PLATFORMS=tpu: JAX cannot use it (none): unset JAX_PLATFORMS" in capsys.readouterr().out
@@ -579,7 +579,7 @@ def train(config, run_dir, progress):
     time.sleep(60)
 stub.train = train
 sys.modules["metrpo.training"] = stub
-from metrpo.cli import main
+from metrpo.commands.main import main
 sys.exit(main(["train", "Swimmer", "--run-dir", "a"]))
 """
 

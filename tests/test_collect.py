@@ -9,7 +9,7 @@ from scipy import stats
 import probe
 from metrpo.config import CollectConfig
 from metrpo.world import collect as real
-from metrpo.world import returned
+from metrpo.world import env_returns
 
 ZERO = lambda state: np.zeros(2)  # noqa: E731
 
@@ -153,18 +153,18 @@ def test_a_close_that_fails_is_told_once_a_run_and_counted(caplog):
 
     def close(times):
         for _ in range(times):
-            with returned.closing(Stuck(), "Stuck"):
+            with env_returns.closing(Stuck(), "Stuck"):
                 pass
         said = [record.getMessage() for record in caplog.records]
         caplog.clear()
         return said
 
     once, of_all = "Stuck: close() raised OSError: port busy; nothing is lost by that", "busy, 5 times in all"
-    with returned.warning_once():
+    with env_returns.warning_once():
         assert close(5) == [once]
     assert [r.getMessage().endswith(of_all) for r in caplog.records] == [True]
     caplog.clear()
-    with returned.warning_once():
+    with env_returns.warning_once():
         assert close(1) == [once], "another run tells it again"
     assert not caplog.records, "one needs no count"
     assert close(2) == [once, once], "outside of a run each counts"

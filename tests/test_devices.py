@@ -13,7 +13,7 @@ import pytest
 
 from helpers import random_ensemble
 from metrpo import devices
-from metrpo.model.shared import can_share
+from metrpo.model.model_parallel import can_share
 from metrpo.run import machine
 
 PREAMBLE = """
@@ -45,7 +45,7 @@ np.savez(OUT, *jax.tree.leaves(fitted), *jax.tree.leaves(info))
 IMPROVE = """
 from metrpo.config import TRPOConfig
 from metrpo.policy import advantage, trpo
-from metrpo.policy.batch import Batch
+from metrpo.policy.improvers.batch import Batch
 from metrpo.types import Trajectories
 rng = np.random.default_rng(0)
 policy = random_policy(0, 4, 2, hidden=(8,))
@@ -56,14 +56,14 @@ assert mesh.size == len(jax.devices())
 
 def work(policy, baseline, *given):
     t = Trajectories(*given)
-    advantages, baseline = advantage.advantages_and_baseline(t, baseline, 0.9, 0.9, 0.1, "rollouts")
+    advantages, baseline = linear.advantages_and_value(t, baseline, 0.9, 0.9, 0.1, "rollouts")
     flat = [jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]) for x in (t.states, t.actions, advantages, t.mask)]
     return advantages, baseline, trpo.improve(policy, Batch(*flat), TRPOConfig(damping=0.1), "rollouts")
 
 share = P(None, "rollouts")
 specs = {"in_specs": (P(), P(), share, share, share, share), "out_specs": (share, P(), P())}
 shared = jax.jit(jax.shard_map(work, mesh=mesh, check_vma=False, **specs))
-out = shared(policy, advantage.init_baseline(4), states, actions, rewards, mask)
+out = shared(policy, linear.init(4), states, actions, rewards, mask)
 assert out[2][1].accepted
 np.savez(OUT, *jax.tree.leaves(out))
 """

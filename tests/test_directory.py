@@ -14,12 +14,12 @@ import pytest
 
 from metrpo import training
 from metrpo.config import Config, TRPOConfig, to_json
+from metrpo.console.progress import Progress
 from metrpo.errors import RunDirectoryError
 from metrpo.run import directory as module
 from metrpo.run.directory import RunDirectory
 from metrpo.run.metrics import read_metrics
 from metrpo.run.policy_file import load_policy
-from metrpo.run.progress import Progress
 
 CONFIG = Config("Swimmer", iterations=5)
 DETERMINISTIC = dataclasses.replace(CONFIG, deterministic=True)

@@ -21,7 +21,8 @@ import pytest
 
 import metrpo
 import probe
-from metrpo import cli, config, options, presets
+from metrpo import config, presets
+from metrpo.commands import main, options
 from metrpo.errors import TaskError
 from metrpo.run import machine
 from pages import PAGES, ROOT, SHELL, Block, blocks, mentioned, typed
@@ -80,7 +81,7 @@ def test_code_runs_and_cheap_commands_too(workshop, monkeypatch, capsys, page):
             continue
         for where, words in typed(block):
             if words[0] in CHEAP and all(Path(word).exists() for word in words if word.startswith("runs")):
-                assert cli.main(words) == 0, f"{where}: metrpo {' '.join(words)}\n{capsys.readouterr().err}"
+                assert main.main(words) == 0, f"{where}: metrpo {' '.join(words)}\n{capsys.readouterr().err}"
 
 
 def save(block):
@@ -113,7 +114,7 @@ def wrong(words: list[str]) -> str:
     except metrpo.MetrpoError as error:
         return str(error)
     if isinstance(command, options.Reproduce):
-        from metrpo.experiments.figures import FIGURES
+        from metrpo.paper.figures import FIGURES
 
         return "" if command.figure in {"all", *FIGURES} else f"no figure {command.figure}"
     return ""
@@ -186,7 +187,7 @@ def test_what_preparing_a_page_does(tmp_path):
     links = prepare["Links"]([], set(), set())
     page = ROOT / "docs" / "tasks.md"
     lead = lambda target: prepare["_target"](page, target, "tasks.md:3", links, "https://example.org/a")  # noqa: E731
-    assert lead("../src/metrpo/cli.py") == "https://example.org/a/blob/main/src/metrpo/cli.py"
+    assert lead("../src/metrpo/commands/main.py") == "https://example.org/a/blob/main/src/metrpo/commands/main.py"
     assert lead("../results") == "https://example.org/a/tree/main/results"
     assert lead("../README.md#results") == "index.md#results"
     assert lead("fast-preset.md#weight-decay") == "fast-preset.md#weight-decay"

@@ -13,16 +13,17 @@ from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 import probe
 from helpers import linear_ensemble, random_ensemble, random_episode
-from metrpo import algorithm, phase, training
+from metrpo import algorithm, policy_phase, training
 from metrpo.config import CollectConfig, Config
 from metrpo.errors import ConfigError, TaskError
-from metrpo.model.imagine import SAMPLINGS, imagine, outcome, returns_per_model
+from metrpo.model.imagine import imagine, outcome, returns_per_model
+from metrpo.model.sampling import SAMPLINGS
 from metrpo.presets import override, preset
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
 from metrpo.world import registry, resolve
-from metrpo.world.check import check_formulas
-from metrpo.world.guard import Guarded
+from metrpo.world.env_wrapper import Guarded
+from metrpo.world.formula_check import check_formulas
 from metrpo.world.registry import get_task
 from metrpo.world.resolve import task_of
 
@@ -500,18 +501,18 @@ def test_short_imagined_episodes_need_a_discount(blind):
 
 def test_short_imagined_episodes_start_anywhere_and_are_more(blind, monkeypatch):
     config = override(LEARN, {**SHORT, "iterations": 1, "imagine.steps": 100, "validate.max_updates": 5})
-    pools, updates = [], phase._updates
+    pools, updates = [], policy_phase._updates
 
     def spied(task, config, ensemble, policy, memory, starts, *rest):
         pools.append(np.asarray(starts))
         return updates(task, config, ensemble, policy, memory, starts, *rest)
 
-    monkeypatch.setattr(phase, "_updates", spied)
+    monkeypatch.setattr(policy_phase, "_updates", spied)
     state = training.train(config)
     assert pools[0].shape == (5, 20, 2), "20 episodes of 5 steps"
     seen = {row.tobytes() for row in state.dataset.train.states}
     assert all(row.tobytes() in seen for row in pools[0].reshape(-1, 2))
-    assert phase.imagined_horizon(override(config, {"imagine.horizon": 500}), blind) == 20, (
+    assert policy_phase.imagined_horizon(override(config, {"imagine.horizon": 500}), blind) == 20, (
         "never longer than real ones"
     )
 

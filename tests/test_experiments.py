@@ -13,24 +13,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from metrpo import options
+from metrpo.commands import options
 from metrpo.config import Config, to_json
 from metrpo.errors import ConfigError
-from metrpo.experiments import local
-from metrpo.experiments import reproduce as running
-from metrpo.experiments.draw import draw
-from metrpo.experiments.figures import FIGURES, PAPER_SECONDS, SCALES, Run, runs_of
-from metrpo.experiments.means import Means
-from metrpo.experiments.publish import publish
-from metrpo.experiments.standing import has_spent, standing
-from metrpo.experiments.summary import curves_of, mean_curve, summarise
+from metrpo.launch import dispatch as running
+from metrpo.launch import local
+from metrpo.launch.backend import Means
+from metrpo.launch.run_spec import RunSpec
+from metrpo.launch.status import has_spent, standing
+from metrpo.paper.figures import FIGURES, PAPER_SECONDS, SCALES, runs_of
+from metrpo.paper.pictures import draw
+from metrpo.paper.publish import publish
+from metrpo.paper.summary import curves_of, mean_curve, summarise
 from metrpo.presets import preset
 from metrpo.run import machine
 from metrpo.run.metrics import read_metrics, to_csv
 from metrpo.systems import SYSTEMS
 from metrpo.world.registry import tasks
 
-RUN = Run("Swimmer", "k-1", 0, (("iterations", 3),), "fast")
+RUN = RunSpec("Swimmer", "k-1", 0, (("iterations", 3),), "fast")
 
 
 def write(out, run, returns, steps=1000, imagined=None, seconds=60.0):
@@ -52,7 +53,7 @@ def write(out, run, returns, steps=1000, imagined=None, seconds=60.0):
 
 
 def runs(system, seeds, task="Swimmer", iterations=3):
-    return [Run(task, system, seed, (("iterations", iterations),), "fast") for seed in range(seeds)]
+    return [RunSpec(task, system, seed, (("iterations", iterations),), "fast") for seed in range(seeds)]
 
 
 # ---------------------------------------------------------------- the tables
@@ -333,7 +334,7 @@ def test_publishing_says_what_is_missing_and_shows_all_seeds_there_are(tmp_path)
     write(tmp_path, c, [0, 3])
     other = dataclasses.replace(a, overrides=(*a.overrides, ("trpo.max_kl", 0.5)))
     told = []
-    write(tmp_path, Run("Ant", "me-trpo", 0, (), "fast"), [7])
+    write(tmp_path, RunSpec("Ant", "me-trpo", 0, (), "fast"), [7])
     numbers = publish(["ensemble-size", "sampling"], "laptop", (), [other, b], tmp_path, told.append)
     assert numbers["ensemble-size"][0]["last"] == [2, 3], "seed 2 was not asked for, but is there"
     assert numbers["ensemble-size"][1]["task"] == "Ant", "nor was this task"

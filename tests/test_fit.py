@@ -15,7 +15,7 @@ from metrpo.config import FitConfig
 from metrpo.model import ensemble as ensembles
 from metrpo.model import fit as fitting
 from metrpo.model.ensemble import Ensemble
-from metrpo.model.passes import minibatch, train_and_validate
+from metrpo.model.epochs import minibatch, train_and_validate
 from metrpo.types import Transitions
 
 KEY = jax.random.key(0)

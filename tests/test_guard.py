@@ -20,7 +20,7 @@ from metrpo.run.policy_file import LoadedPolicy, PolicyInfo
 from metrpo.run.video import VideoError
 from metrpo.world import collect as real
 from metrpo.world import registry
-from metrpo.world.guard import Guarded
+from metrpo.world.env_wrapper import Guarded
 from metrpo.world.resolve import task_of
 from metrpo.world.task import Task
 

@@ -14,7 +14,8 @@ import probe
 from helpers import linear_ensemble, on_host, random_ensemble, random_normaliser, random_policy, slow_delta, slow_mean
 from metrpo.model import imagine as imagining
 from metrpo.model.ensemble import Ensemble
-from metrpo.model.imagine import Keys, imagine, model_choice, returns_per_model, step_rand
+from metrpo.model.imagine import imagine, returns_per_model
+from metrpo.model.sampling import Keys, model_choice, step_rand
 from metrpo.policy import gaussian
 
 KEY = jax.random.key(0)

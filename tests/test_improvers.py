@@ -14,14 +14,15 @@ from jax.flatten_util import ravel_pytree
 
 import probe
 from helpers import linear_ensemble, on_host, random_ensemble, random_policy, slow_mean
-from metrpo import phase
+from metrpo import policy_phase
 from metrpo.config import Config, GradientConfig, PPOConfig
 from metrpo.model.imagine import imagine
-from metrpo.policy import advantage, bptt, ppo, vpg
-from metrpo.policy.ascent import ascend, init_moments
-from metrpo.policy.batch import Batch
 from metrpo.policy.gaussian import Policy
-from metrpo.policy.improve import IMPROVERS, init_memory
+from metrpo.policy.improvers import bptt, ppo, vpg
+from metrpo.policy.improvers.adam import ascend, init_moments
+from metrpo.policy.improvers.batch import Batch
+from metrpo.policy.improvers.table import IMPROVERS, init_memory
+from metrpo.policy.value import linear
 from metrpo.presets import override
 
 KEY = jax.random.key(0)
@@ -360,12 +361,12 @@ def test_every_improver_comes_close_to_the_optimum_of_the_probe(name):
     ensemble = linear_ensemble([(probe.A, probe.B)])
     policy = jax.tree.map(jnp.asarray, random_policy(0, 2, 2, (), scale=0.3, std=0.5))
     pool, tests = np.split(np.random.default_rng(0).uniform(-0.7, 0.7, (60 * 30 + 50, 2)).astype(np.float32), [1800])
-    memory = init_memory(config, policy, advantage.init_baseline(2))
-    new, after, (info, _) = phase._updates(
+    memory = init_memory(config, policy, linear.init(2))
+    new, after, (info, _) = policy_phase._updates(
         probe.PROBE, config, ensemble, policy, memory, pool.reshape(60, 30, 2), jax.random.key(1)
     )
     optimum = -np.mean(np.sum(tests @ probe.riccati()[0] * tests, axis=1))
-    before, reached = (phase.values_of(probe.PROBE, ensemble, p, tests)[0] for p in (policy, new))
+    before, reached = (policy_phase.values_of(probe.PROBE, ensemble, p, tests)[0] for p in (policy, new))
     assert before < 20 * optimum
     assert 1.2 * optimum < reached < 0.999 * optimum
     assert np.all(info.accepted)

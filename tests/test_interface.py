@@ -8,7 +8,7 @@ from gymnasium.spaces import Box, Dict, Tuple
 import metrpo
 from metrpo.run.directory import _interface
 from metrpo.world.interface import of_env
-from metrpo.world.known import KNOWN
+from metrpo.world.tasks.gymnasium_formulas import KNOWN
 
 EACH = ["Pendulum-v1", "mbbl/HalfCheetah", *(name for name, known in KNOWN.items() if known.added)]
 

@@ -16,8 +16,8 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import RescaleAction
 
 from metrpo.errors import TaskError
-from metrpo.world import mbbl
-from metrpo.world.known import _TORSO, KNOWN, _centre_x
+from metrpo.world.tasks import mbbl
+from metrpo.world.tasks.gymnasium_formulas import _TORSO, KNOWN, _centre_x
 
 SIZES = {  # S, A, T, dimensions that are global positions
     "Pendulum-v1": (3, 1, 200, ()),

@@ -9,7 +9,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from helpers import random_policy
-from metrpo.policy import gaussian, linearised
+from metrpo.policy import gaussian
+from metrpo.policy.improvers import linearised
 
 
 @pytest.fixture(autouse=True)

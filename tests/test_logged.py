@@ -13,7 +13,7 @@ from metrpo.config import Config
 from metrpo.errors import ConfigError, TaskError
 from metrpo.presets import override
 from metrpo.world import collect as real
-from metrpo.world import logged
+from metrpo.world import offline_data
 
 
 @pytest.fixture(autouse=True)
@@ -48,7 +48,7 @@ def write(path, **changes):
 def test_episodes_come_back_as_they_were_logged(tmp_path, task):
     episodes = random_episodes(task)
     np.savez(tmp_path / "log.npz", **arrays_of(episodes))
-    read = logged.load(tmp_path / "log.npz", task)
+    read = offline_data.load(tmp_path / "log.npz", task)
     assert len(read) == len(episodes)
     for a, b in zip(read, episodes, strict=True):
         for x, y in zip(a, b, strict=True):
@@ -69,14 +69,14 @@ def test_episodes_come_back_as_they_were_logged(tmp_path, task):
         ({"terminated": np.array(["no"] * 600)}, "terminated: expected numbers of shape"),
         ({"states": np.array([None] * 600, object)}, "cannot be read .*pickle"),
         (
-            dict.fromkeys(logged.ARRAYS, np.zeros((0, 2))) | {"rewards": np.zeros(0), "terminated": np.zeros(0)},
+            dict.fromkeys(offline_data.ARRAYS, np.zeros((0, 2))) | {"rewards": np.zeros(0), "terminated": np.zeros(0)},
             "got none",
         ),
     ],
 )
 def test_what_does_not_fit_is_refused(tmp_path, changes, message):
     with pytest.raises(TaskError, match=message):
-        logged.load(write(tmp_path / "log.npz", **changes), probe.PROBE)
+        offline_data.load(write(tmp_path / "log.npz", **changes), probe.PROBE)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no archive", b"PK\x03\x04 cut off"])
@@ -85,7 +85,7 @@ def test_a_file_that_is_no_archive_is_refused(tmp_path, content):
         (tmp_path / "log.npz").write_bytes(content)
     expected = "there is no such file; expected an .npz of states, actions, " if content is None else "cannot be read"
     with pytest.raises(TaskError, match=expected):
-        logged.load(tmp_path / "log.npz", probe.PROBE)
+        offline_data.load(tmp_path / "log.npz", probe.PROBE)
 
 
 OFFLINE = override(

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from PIL import Image
 from tensorboardX.proto.event_pb2 import Event
 
-from metrpo.run import report
+from metrpo.run import curve
+from metrpo.run.curve import draw_curve
 from metrpo.run.metrics import Events, plain, read_metrics, to_csv, without_clocks
-from metrpo.run.report import draw_curve
 
 cells = st.none() | st.integers(-(2**63), 2**63) | st.floats()
 
@@ -97,9 +97,9 @@ def test_a_curve_is_drawn_whatever_the_numbers(tmp_path, rows):
 
 
 def test_imagined_points_lie_within_the_axis_where_no_evaluation_succeeded(monkeypatch, tmp_path):
-    limits, drawn = [], report._draw_returns
+    limits, drawn = [], curve._draw_returns
     monkeypatch.setattr(
-        report, "_draw_returns", lambda axes, *rest: (drawn(axes, *rest), limits.append(axes.get_ylim()))
+        curve, "_draw_returns", lambda axes, *rest: (drawn(axes, *rest), limits.append(axes.get_ylim()))
     )
     row = CURVE | {"return_real": math.nan, "return_real_std": math.nan, "return_imagined": 900.0, "real_steps": 100}
     for r in (row, row | {"return_real": 1.0, "return_real_std": 0.1}):

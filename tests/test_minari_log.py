@@ -11,7 +11,7 @@ import pytest
 from gymnasium.spaces import Box, Dict
 
 from metrpo.errors import TaskError
-from metrpo.world import logged
+from metrpo.world import offline_data
 from metrpo.world.registry import get_task
 from metrpo.world.resolve import task_of
 
@@ -68,7 +68,7 @@ def test_episodes_come_as_they_were_played_with_actions_in_our_range():
     recorder = Recorder(gymnasium.make("Pendulum-v1")).play(seed=1).play(seed=2)
     recorder.save("pendulum/random-v0")
     task = get_task("Pendulum-v1")
-    episodes = logged.load("minari:pendulum/random-v0", task)
+    episodes = offline_data.load("minari:pendulum/random-v0", task)
     assert [len(e.rewards) for e in episodes] == [200, 200]
     for found, (states, actions, rewards, _, _) in zip(episodes, recorder.episodes, strict=True):
         np.testing.assert_allclose(found.states, states, rtol=1e-6)
@@ -104,7 +104,7 @@ def test_observations_of_several_parts_are_flattened_as_in_training():
     recorder = Recorder(Ending()).play(seed=0)
     recorder.save("ending/random-v0")
     task = task_of(Ending, horizon=10)
-    (episode,) = logged.load("minari:ending/random-v0", task)
+    (episode,) = offline_data.load("minari:ending/random-v0", task)
     assert episode.terminated is True
     assert episode.states.shape == (4, 3)
     np.testing.assert_array_equal(episode.states[:, 0], [0, 1, 2, 3])  # "age" comes before "place"
@@ -116,7 +116,7 @@ def test_observations_of_several_parts_are_flattened_as_in_training():
 def test_what_does_not_fit_is_named():
     Recorder(gymnasium.make("Pendulum-v1")).play(seed=1).save("pendulum/random-v0")
     with pytest.raises(TaskError, match="observations: expected 10 numbers for Swimmer, got 3"):
-        logged.load("minari:pendulum/random-v0", get_task("Swimmer"))
+        offline_data.load("minari:pendulum/random-v0", get_task("Swimmer"))
 
 
 def test_a_dataset_that_nobody_has_is_one_message(monkeypatch):
@@ -127,10 +127,10 @@ def test_a_dataset_that_nobody_has_is_one_message(monkeypatch):
     with pytest.raises(
         TaskError, match=r"minari:no/such-v0: expected a data set's full name, such as .*minari list remote"
     ):
-        logged.load("minari:no/such-v0", get_task("Swimmer"))
+        offline_data.load("minari:no/such-v0", get_task("Swimmer"))
 
 
 def test_without_minari_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "minari", None)
     with pytest.raises(TaskError, match=r"pip install 'metrpo\[minari\]'"):
-        logged.load("minari:no/such-v0", get_task("Swimmer"))
+        offline_data.load("minari:no/such-v0", get_task("Swimmer"))

@@ -21,7 +21,7 @@ from metrpo.model import ensemble as ensembles
 from metrpo.model.diagnostics import unknown
 from metrpo.model.ensemble import Ensemble
 from metrpo.model.fit import FitInfo
-from metrpo.phase import PhaseInfo
+from metrpo.policy_phase import PhaseInfo
 from metrpo.presets import override, preset
 from metrpo.run import directory as directories
 from metrpo.run.checkpoint import load_state, save_state

@@ -15,17 +15,17 @@ from typing import get_args
 
 import pytest
 
-from metrpo import cli, options
+from metrpo.commands import main, options
+from metrpo.console.interrupt import Stopped
 from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError
-from metrpo.experiments import on_node, on_ray, sent
-from metrpo.experiments.figures import Run
-from metrpo.experiments.means import Backend, Means
-from metrpo.experiments.on_node import Ended, Order
-from metrpo.experiments.reproduce import BACKENDS
-from metrpo.run import claim
-from metrpo.run.interrupt import Stopped
+from metrpo.launch.backend import Backend, Means
+from metrpo.launch.dispatch import BACKENDS
+from metrpo.launch.ray import driver, sync, worker
+from metrpo.launch.ray.worker import Ended, Order
+from metrpo.launch.run_spec import RunSpec
+from metrpo.run import lock
 
-RUNS = [Run("Swimmer", "k-1", seed, (("iterations", 3),), "fast") for seed in range(4)]
+RUNS = [RunSpec("Swimmer", "k-1", seed, (("iterations", 3),), "fast") for seed in range(4)]
 ROW = {"iteration": 3, "real_steps": 30, "return_real": 1.5}
 MEANS = Means("ray", jobs=2, cpus=3, gpus=0.5, address="auto", storage="sent")
 SHARED = dataclasses.replace(MEANS, storage="shared")
@@ -70,7 +70,7 @@ def test_without_ray_it_is_said_how_to_get_it(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)
     before = signal.getsignal(signal.SIGTERM)
     try:
-        assert cli.main(["sweep", "--seeds", "0", "--backend", "ray", "--out", str(tmp_path)]) == 2
+        assert main.main(["sweep", "--seeds", "0", "--backend", "ray", "--out", str(tmp_path)]) == 2
     finally:
         signal.signal(signal.SIGTERM, before)
     assert "pip install 'metrpo[ray]'" in capsys.readouterr().err
@@ -144,7 +144,7 @@ class FakeRay:
 @pytest.fixture
 def on(monkeypatch, tmp_path):
     """Runs RUNS on a fake cluster; returns the cluster, the failed runs and what was told."""
-    monkeypatch.setattr(on_ray, "_POLL", 0.001)
+    monkeypatch.setattr(driver, "_POLL", 0.001)
     # A shell that starts the tests in the background has Ctrl-C ignored.
     handlers = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
     before = {number: signal.signal(number, handler) for number, handler in handlers.items()}
@@ -153,7 +153,7 @@ def on(monkeypatch, tmp_path):
         monkeypatch.setitem(sys.modules, "ray", ray)
         told = []
         try:
-            return on_ray.run_on_ray(RUNS, tmp_path, means, told.append), told
+            return driver.run_on_ray(RUNS, tmp_path, means, told.append), told
         finally:
             assert not ray.on, "the cluster is let go"
             assert {n: signal.getsignal(n) for n in handlers} == handlers, "handlers are put back"
@@ -170,10 +170,10 @@ def test_what_is_asked_of_ray(on, monkeypatch, tmp_path):
     assert failed == []
     assert ray.address == "auto"
     assert (ray.asked["num_cpus"], ray.asked["num_gpus"]) == (3, 0.5)
-    assert ray.asked["max_retries"] == on_ray.RETRIES
+    assert ray.asked["max_retries"] == driver.RETRIES
     assert ray.asked["retry_exceptions"] is False
     assert ray.most == 2, "jobs"
-    assert ray.function is on_node.attend
+    assert ray.function is worker.attend
     (order,) = ray.orders[1]
     directory = str(tmp_path / RUNS[1].name)
     assert order.words == ("train", *RUNS[1].arguments, "--run-dir", directory, "--no-video")
@@ -190,11 +190,11 @@ def test_what_is_asked_of_ray(on, monkeypatch, tmp_path):
 
 
 def test_what_is_asked_of_machines_that_share_no_disk(on, monkeypatch, tmp_path):
-    monkeypatch.setattr(on_ray.sent, "start_store", lambda ray, out: f"the store of {out}")
+    monkeypatch.setattr(driver.sent, "start_store", lambda ray, out: f"the store of {out}")
     ray = FakeRay([Ended(0, (ROW,), 7.0)] * 4)
     failed, _ = on(ray, MEANS)
     assert failed == []
-    assert ray.function is sent.attend_for
+    assert ray.function is sync.attend_for
     order, name, store = ray.orders[2]
     assert (order.directory, name, store) == (str(tmp_path / name), RUNS[2].name, f"the store of {tmp_path}")
 
@@ -266,28 +266,28 @@ def test_what_is_forwarded():
         "RAY_ADDRESS": "there",
     }
     kept = {"XLA_FLAGS", "JAX_PLATFORMS", "MUJOCO_GL", "OMP_NUM_THREADS", "METRPO_X", "PYTHONPATH"}
-    assert on_node.forwarded(here) == {name: here[name] for name in kept}
+    assert worker.forwarded(here) == {name: here[name] for name in kept}
 
 
 def test_a_run_gets_its_share_of_the_machine(tmp_path):
     here = {"CUDA_VISIBLE_DEVICES": "1", "PATH": "/bin", "OMP_NUM_THREADS": "64"}
-    found = on_node.surroundings(order(tmp_path), here)
+    found = worker.surroundings(order(tmp_path), here)
     assert found["PATH"] == "/bin"
     assert found["JAX_PLATFORMS"] == "cpu"
     assert {found[name] for name in ("NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")} == {"2"}
     assert found["XLA_FLAGS"] == "--xla_force_host_platform_device_count=2"
-    found = on_node.surroundings(order(tmp_path, gpus=1.0), here)
+    found = worker.surroundings(order(tmp_path, gpus=1.0), here)
     assert found["CUDA_VISIBLE_DEVICES"] == "1", "Ray's choice"
     assert not {"JAX_PLATFORMS", "XLA_PYTHON_CLIENT_MEM_FRACTION"} & set(found)
-    found = on_node.surroundings(order(tmp_path, gpus=0.25), here)
+    found = worker.surroundings(order(tmp_path, gpus=0.25), here)
     assert float(found["XLA_PYTHON_CLIENT_MEM_FRACTION"]) == pytest.approx(0.225)
     mine = {"NPROC": "5", "JAX_PLATFORMS": "cuda", "XLA_FLAGS": "--xla_force_host_platform_device_count=7"}
-    found = on_node.surroundings(order(tmp_path, environment=mine), here)
+    found = worker.surroundings(order(tmp_path, environment=mine), here)
     assert {name: found[name] for name in mine} == mine, "what was forwarded counts"
 
 
 def test_a_run_is_a_process_of_its_own(tmp_path):
-    ended = on_node.attend(order(tmp_path, "train", "Swimer", "--run-dir", "out/run"))
+    ended = worker.attend(order(tmp_path, "train", "Swimer", "--run-dir", "out/run"))
     assert (ended.code, ended.rows) == (2, ())
     log = (tmp_path / "out" / "run.log").read_text()
     assert log.startswith(f"metrpo: on {os.uname().nodename}\n")
@@ -298,15 +298,15 @@ def test_the_last_row_is_told(tmp_path):
     directory = tmp_path / "out" / "run"
     directory.mkdir(parents=True)
     (directory / "metrics.csv").write_text("iteration,real_steps\n1,10\n2,20\n")
-    assert on_node.attend(order(tmp_path, "--version")).rows == ({"iteration": 2, "real_steps": 20},)
+    assert worker.attend(order(tmp_path, "--version")).rows == ({"iteration": 2, "real_steps": 20},)
 
 
 def test_where_the_disk_is_not_shared_it_is_said(tmp_path):
     with pytest.raises(MetrpoError, match="expected the folder /nowhere, got none"):
-        on_node.attend(order(tmp_path, folder="/nowhere"))
+        worker.attend(order(tmp_path, folder="/nowhere"))
     (tmp_path / "out").touch()
     with pytest.raises(MetrpoError, match=r"cannot write .*out/run"):
-        on_node.attend(order(tmp_path))
+        worker.attend(order(tmp_path))
 
 
 def test_a_task_that_is_cancelled_asks_its_run_to_stop(monkeypatch):
@@ -318,25 +318,25 @@ def test_a_task_that_is_cancelled_asks_its_run_to_stop(monkeypatch):
             raise left.pop()
         sleep(seconds)
 
-    monkeypatch.setattr(on_node.time, "sleep", interrupted)
-    assert on_node._wait(process, lambda: None) == -signal.SIGTERM
+    monkeypatch.setattr(worker.time, "sleep", interrupted)
+    assert worker._wait(process, lambda: None) == -signal.SIGTERM
 
 
 def test_a_directory_that_is_held_is_waited_for(tmp_path, monkeypatch):
-    monkeypatch.setattr(claim, "_POLL", 0.01)
-    lock = claim.hold(tmp_path)
-    with pytest.raises(claim.DirectoryInUse, match="is in use by another process"):
-        claim.wait_until_free(tmp_path, 0.05)
-    threading.Timer(0.2, lock.close).start()
-    claim.wait_until_free(tmp_path, 60)
-    assert lock.closed
+    monkeypatch.setattr(lock, "_POLL", 0.01)
+    held = lock.hold(tmp_path)
+    with pytest.raises(lock.DirectoryInUse, match="is in use by another process"):
+        lock.wait_until_free(tmp_path, 0.05)
+    threading.Timer(0.2, held.close).start()
+    lock.wait_until_free(tmp_path, 60)
+    assert held.closed
     with pytest.raises(RunDirectoryError, match="cannot write"):
-        claim.wait_until_free(tmp_path / "none", 60)
+        lock.wait_until_free(tmp_path / "none", 60)
 
 
 PARENT = """
 import os, subprocess, sys, time
-child = "import sys, time; from metrpo.experiments.tied import tie; tie(int(sys.argv[1]));"
+child = "import sys, time; from metrpo.launch.tied import tie; tie(int(sys.argv[1]));"
 child += "print('tied', flush=True); time.sleep(100)"
 subprocess.Popen([sys.executable, "-c", child, str(os.getpid())])
 time.sleep(100)
@@ -356,7 +356,7 @@ def test_a_run_ends_with_its_killed_parent():
 
 
 def test_a_run_whose_parent_has_gone_does_not_begin():
-    line = [sys.executable, "-m", "metrpo.experiments.tied", "1", "--version"]
+    line = [sys.executable, "-m", "metrpo.launch.tied", "1", "--version"]
     done = subprocess.run(line, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (1, "")
     assert "its parent 1 has ended" in done.stderr

@@ -11,8 +11,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from metrpo.bench import peers, worker_loop
 from metrpo.errors import MetrpoError
+from metrpo.speed import peer_loop, peers
 
 BENCH = Path(peers.__file__).parent
 
@@ -101,8 +101,8 @@ def test_the_work_is_built_once_and_warmed_up_once(worker):
 
 def test_seconds_are_those_of_one_call(monkeypatch):
     clock, calls = iter([10.0, 16.0]), []
-    monkeypatch.setattr(worker_loop, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
-    assert worker_loop.timed(lambda: calls.append(1), 3) == 2.0
+    monkeypatch.setattr(peer_loop, "time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    assert peer_loop.timed(lambda: calls.append(1), 3) == 2.0
     assert len(calls) == 3
 
 

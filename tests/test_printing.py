@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from metrpo.console.encoding import print_anywhere
+from metrpo.console.progress import LiveProgress, PlainProgress
 from metrpo.run import machine
-from metrpo.run.printing import print_anywhere
-from metrpo.run.progress import LiveProgress, PlainProgress
 
 ROW = {"iteration": 1, "real_steps": 200, "return_real": 1.5, "return_real_std": 0.5}
 

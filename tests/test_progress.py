@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from metrpo.run.progress import (
+from metrpo.console.progress import (
     SILENT,
     Guarded,
     LiveProgress,

@@ -9,12 +9,11 @@ from pathlib import Path
 import pytest
 
 from metrpo import read_metrics
-from metrpo.bench.report import Report
-from metrpo.experiments.figures import FIGURES
-from metrpo.experiments.reproduce import runs_there
-from metrpo.experiments.summary import as_markdown
-from metrpo.experiments.summary import summarise as summarise_figure
+from metrpo.paper.figures import FIGURES, runs_there
+from metrpo.paper.summary import as_markdown
+from metrpo.paper.summary import summarise as summarise_figure
 from metrpo.run.files import folder_name
+from metrpo.speed.measure import Report
 
 ROOT = Path(__file__).resolve().parents[1]
 RUNS = sorted(path.parent for path in (ROOT / "results").glob("*/*/*/seed-*/metrics.csv"))

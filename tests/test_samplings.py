@@ -15,7 +15,8 @@ import probe
 from helpers import linear_ensemble, on_host, random_ensemble, slow_delta
 from metrpo.config import ImagineConfig
 from metrpo.model.ensemble import Ensemble
-from metrpo.model.imagine import SAMPLINGS, Keys, imagine
+from metrpo.model.imagine import imagine
+from metrpo.model.sampling import SAMPLINGS, Keys
 
 MEMBERS = 3
 DRAWN = ("step_rand", "eps_rand")

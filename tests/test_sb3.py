@@ -17,16 +17,16 @@ import probe
 from metrpo import training
 from metrpo.algorithm import evaluate
 from metrpo.baselines import openai_defaults as defaults
-from metrpo.baselines import sb3
+from metrpo.baselines import stable_baselines
 from metrpo.config import Config
+from metrpo.console.progress import Progress
 from metrpo.errors import MetrpoError
 from metrpo.policy import gaussian
 from metrpo.presets import override
 from metrpo.run import directory
 from metrpo.run.checkpoint import load_state, save_state
+from metrpo.run.curve import draw_curve
 from metrpo.run.policy_file import load_policy, save_policy
-from metrpo.run.progress import Progress
-from metrpo.run.report import draw_curve
 from metrpo.seeds import Stage
 
 TINY = override(
@@ -49,9 +49,9 @@ def runs():
 
 
 def run(config, iterations):
-    states, rows = [sb3.init(config)], []
+    states, rows = [stable_baselines.init(config)], []
     for _ in range(iterations):
-        state, row = sb3.step(config, states[-1])
+        state, row = stable_baselines.step(config, states[-1])
         states.append(state)
         rows.append(row)
     return states, rows
@@ -96,8 +96,8 @@ def test_the_networks_and_adam_change_and_are_kept(runs, method):
 @METHODS
 def test_the_state_goes_into_the_librarys_objects_and_comes_out_again(runs, method):
     config, state = override(TINY, {"method": method}), runs[method][0][3]
-    env = sb3._environment(config)
-    assert equal(sb3._state(config, sb3._model(config, env, 0, state), 3), state)
+    env = stable_baselines._environment(config)
+    assert equal(stable_baselines._state(config, stable_baselines._model(config, env, 0, state), 3), state)
     env.close()
 
 
@@ -105,7 +105,7 @@ def test_the_state_goes_into_the_librarys_objects_and_comes_out_again(runs, meth
 def test_a_step_leaves_its_state_as_it_was_and_can_be_taken_again(runs, method):
     config, (states, rows) = override(TINY, {"method": method}), runs[method]
     before = jax.tree.map(np.array, states[1])
-    again, row = sb3.step(config, states[1])
+    again, row = stable_baselines.step(config, states[1])
     assert equal(states[1], before)
     assert equal(again, states[2])
     assert {n: x for n, x in row.items() if "seconds" not in n} == {
@@ -120,10 +120,10 @@ def test_a_checkpoint_gives_the_state_back_and_the_run_goes_on_as_if_uninterrupt
     # Nothing may hang on what this process has drawn before.
     torch.manual_seed(99)
     np.random.seed(99)
-    state, _ = load_state(tmp_path / "state.npz", sb3.init(config))
+    state, _ = load_state(tmp_path / "state.npz", stable_baselines.init(config))
     assert equal(state, states[2])
     assert all(isinstance(x, int | np.ndarray) for x in jax.tree.leaves(state))
-    resumed, _ = sb3.step(config, state)
+    resumed, _ = stable_baselines.step(config, state)
     assert equal(resumed, states[3])
 
 
@@ -155,8 +155,8 @@ def test_the_seed_decides_the_whole_run(runs, method):
 def test_the_exported_policy_acts_as_stable_baselines3_predicts(runs, method, tmp_path):
     config, state = override(TINY, {"method": method}), runs[method][0][3]
     states = np.random.default_rng(0).normal(scale=3.0, size=(1000, 2)).astype(np.float32)
-    env = sb3._environment(config)
-    expected, _ = sb3._model(config, env, 0, state).predict(states, deterministic=True)
+    env = stable_baselines._environment(config)
+    expected, _ = stable_baselines._model(config, env, 0, state).predict(states, deterministic=True)
     env.close()
     np.testing.assert_allclose(np.clip(gaussian.mean(state.policy, states), -1, 1), expected, atol=1e-5)
     save_policy(tmp_path, state.policy, "Probe", 3, state.real_steps, None)
@@ -209,7 +209,7 @@ def test_real_steps_are_counted_one_by_one(monkeypatch, method, steps, taken):
     counted = Counted(monkeypatch)
     monkeypatch.setattr(defaults, "PPO_STEPS", 256)
     config = override(TINY, {"method": method, "collect.steps": steps})
-    state, row = sb3.step(config, sb3.init(config))
+    state, row = stable_baselines.step(config, stable_baselines.init(config))
     evaluated = config.evaluation_episodes * probe.HORIZON
     assert state.real_steps == row["real_steps"] == counted.steps - evaluated == taken
     assert len(state.replay.get("rewards", [])) == (taken if method == "ddpg" else 0)
@@ -250,7 +250,7 @@ def test_ppo_values_nothing_after_the_end_of_the_clock(monkeypatch, discount):
 
     monkeypatch.setattr(defaults.PPO, "train", train)
     config = override(TINY, {"method": "ppo", "advantage.discount": discount})
-    sb3.step(config, sb3.init(config))
+    stable_baselines.step(config, stable_baselines.init(config))
     (last, *_) = np.flatnonzero(seen["first"][1:])
     action = np.clip(seen["actions"][last], -1, 1).astype(float)
     reward = probe.reward(None, action, probe.A @ seen["states"][last] + probe.B @ action)
@@ -295,7 +295,7 @@ def test_statistics_are_running_ones_and_fold_into_a_layer():
 def test_networks_see_observations_by_their_statistics(runs, method):
     """Another unit and another zero of the observations, taken in by the statistics, change nothing."""
     config, state = override(TINY, {"method": method}), runs[method][0][3]
-    env, scale, shift = sb3._environment(config), np.array([50.0, 4.0]), np.array([300.0, -20.0])
+    env, scale, shift = stable_baselines._environment(config), np.array([50.0, 4.0]), np.array([300.0, -20.0])
     n = state.statistics["count"]
     moved = state._replace(
         statistics={
@@ -307,8 +307,10 @@ def test_networks_see_observations_by_their_statistics(runs, method):
         }
     )
     states = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
-    expected, _ = sb3._model(config, env, 0, state).predict(states, deterministic=True)
-    got, _ = sb3._model(config, env, 0, moved).predict((states * scale + shift).astype(np.float32), deterministic=True)
+    expected, _ = stable_baselines._model(config, env, 0, state).predict(states, deterministic=True)
+    got, _ = stable_baselines._model(config, env, 0, moved).predict(
+        (states * scale + shift).astype(np.float32), deterministic=True
+    )
     env.close()
     np.testing.assert_allclose(got, expected, atol=2e-3)
     assert np.ptp(expected) > 0.02
@@ -335,8 +337,8 @@ def test_the_critic_normalises_its_layers_and_takes_the_action_in_its_second():
 
 def test_l2_pulls_on_the_critics_hidden_weights_alone(runs):
     config, state = override(TINY, {"method": "ddpg"}), runs["ddpg"][0][3]
-    env = sb3._environment(config)
-    model = sb3._model(config, env, 0, state)
+    env = stable_baselines._environment(config)
+    model = stable_baselines._model(config, env, 0, state)
     env.close()
     critic = model.critic
     for memory in critic.optimizer.state.values():
@@ -370,7 +372,7 @@ def test_the_replay_buffer_forgets_the_oldest_first(monkeypatch):
 
 def test_no_episode_finished_is_no_return():
     config = override(TINY, {"method": "ddpg", "collect.steps": 10})
-    _, row = sb3.step(config, sb3.init(config))
+    _, row = stable_baselines.step(config, stable_baselines.init(config))
     assert np.isnan(row["return_collected"])
 
 
@@ -386,7 +388,7 @@ def test_progress_is_told_of_both_stages():
 
     config = override(TINY, {"method": "ddpg"})
     states, _ = run(config, 1)
-    _, row = sb3.step(config, states[1], Told())
+    _, row = stable_baselines.step(config, states[1], Told())
     assert told == [("learn", 128), 100, 200, ("evaluate", 2)]
     assert row["seconds_collect"] > 0
     assert row["seconds_improve"] > 0
@@ -403,8 +405,8 @@ def test_the_curve_can_be_drawn_without_the_models_columns(runs, tmp_path):
 @METHODS
 def test_the_algorithm_has_the_settings_named(method):
     config = override(TINY, {"method": method})
-    env = sb3._environment(config)
-    model = sb3._model(config, env, sb3._seed(config, 0, Stage.INIT), None)
+    env = stable_baselines._environment(config)
+    model = stable_baselines._model(config, env, stable_baselines._seed(config, 0, Stage.INIT), None)
     env.close()
     sizes = {name: tuple(x.shape) for name, x in model.policy.named_parameters() if name.endswith("weight")}
     if method == "ppo":
@@ -416,7 +418,7 @@ def test_the_algorithm_has_the_settings_named(method):
         assert (model.gamma, model.tau, model.batch_size, model.learning_starts) == (1.0, 0.01, 64, 64)
         assert (model.train_freq.frequency, model.gradient_steps, model.policy_delay) == (100, 50, 1)
         model._update_learning_rate([model.actor.optimizer, model.critic.optimizer])
-        assert [{g["lr"] for g in o.param_groups} for o in sb3._optimisers(model)] == [{1e-4}, {1e-3}]
+        assert [{g["lr"] for g in o.param_groups} for o in stable_baselines._optimisers(model)] == [{1e-4}, {1e-3}]
         assert sizes["critic.qf0.second.weight"] == (64, 64 + 2)
     assert torch.get_num_threads() == 1
 

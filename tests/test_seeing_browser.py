@@ -12,8 +12,8 @@ from PIL import Image
 
 from browser import Browser, chromium
 from metrpo.config import EnsembleConfig
-from metrpo.seeing.page import page
-from metrpo.seeing.runs import find
+from metrpo.report.page import page
+from metrpo.run.find import find
 from test_seeing_health import exploiting, healthy
 from test_seeing_page import CONFIG, ONE, RESULTS, a_run, details
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from metrpo.checks.health import CHECKS, examine
 from metrpo.config import Config, EnsembleConfig, ImagineConfig, ValidateConfig
-from metrpo.seeing.health import CHECKS, examine
-from metrpo.seeing.runs import find
+from metrpo.run.find import find
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 CONFIG = Config("Swimmer", validate=ValidateConfig(max_updates=100))

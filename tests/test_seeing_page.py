@@ -10,17 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from metrpo.cli import main
+from metrpo.checks.health import examine
+from metrpo.commands.main import main
 from metrpo.config import Config, EnsembleConfig, ImagineConfig, to_json
+from metrpo.console.watch import standing
 from metrpo.errors import RunDirectoryError
+from metrpo.report import page as pages
+from metrpo.report.charts import Line, bars, chart, number, real_frame
+from metrpo.report.page import page, record
+from metrpo.run.curve import draw_curve
+from metrpo.run.find import Found, SeenRun, find, group
 from metrpo.run.metrics import read_metrics, to_csv
-from metrpo.run.report import draw_curve
-from metrpo.seeing import page as pages
-from metrpo.seeing.health import examine
-from metrpo.seeing.page import page, record
-from metrpo.seeing.runs import Found, SeenRun, find, group
-from metrpo.seeing.svg import Line, bars, chart, number, real_frame
-from metrpo.seeing.watch import standing
 from test_seeing_health import healthy
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"

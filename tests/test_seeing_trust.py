@@ -6,12 +6,12 @@ import re
 import numpy as np
 import pytest
 
+from metrpo.report.charts import Line, chart
+from metrpo.report.heatmap import heat
+from metrpo.report.page import page
+from metrpo.report.trust import trust_of
+from metrpo.run.find import find
 from metrpo.run.metrics import to_csv
-from metrpo.seeing.heat import heat
-from metrpo.seeing.page import page
-from metrpo.seeing.runs import find
-from metrpo.seeing.svg import Line, chart
-from metrpo.seeing.trust import trust_of
 from test_seeing_health import NAN, healthy
 from test_seeing_page import CONFIG, ONE, Page, a_run, details, numbers_in
 

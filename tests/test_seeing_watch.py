@@ -17,15 +17,15 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from metrpo.cli import main
+from metrpo.commands.main import main
 from metrpo.config import Config, EnsembleConfig
+from metrpo.console import watch as watching
+from metrpo.console.watch import SPARKS, is_running, sparkline, standing, watch
+from metrpo.plots.bands import curve
 from metrpo.policy.gaussian import Policy
-from metrpo.run.claim import claim
 from metrpo.run.directory import RunDirectory
-from metrpo.seeing import watch as watching
-from metrpo.seeing.curves import curve
-from metrpo.seeing.runs import find, group, read
-from metrpo.seeing.watch import SPARKS, is_running, sparkline, standing, watch
+from metrpo.run.find import find, group, read
+from metrpo.run.lock import claim
 from metrpo.types import Episode
 from test_seeing_health import healthy
 from test_seeing_page import a_run, details
@@ -438,9 +438,8 @@ def test_every_help_has_examples(capsys, command):
 
 def test_looking_needs_neither_jax_nor_mujoco(tmp_path):
     a_run(tmp_path / "a", CONFIG, TIMED)
-    code = (
-        "import sys; from metrpo.cli import main; assert main(['report', 'a']) == main(['watch', 'a', '--once']) == 0; "
-    )
+    code = "import sys; from metrpo.commands.main import main; "
+    code += "assert main(['report', 'a']) == main(['watch', 'a', '--once']) == 0; "
     code += "print([m for m in ('jax', 'mujoco', 'gymnasium', 'matplotlib') if m in sys.modules])"
     ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ran.stdout.splitlines()[-1] == "[]"

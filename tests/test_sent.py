@@ -11,11 +11,11 @@ from types import SimpleNamespace
 import pytest
 
 from metrpo.errors import RunDirectoryError
-from metrpo.experiments import on_node, sent, store
-from metrpo.experiments.on_node import Ended, Order
-from metrpo.experiments.sent import Copy
-from metrpo.experiments.store import Changes, Store, Superseded
-from metrpo.run import claim
+from metrpo.launch.ray import store, sync, worker
+from metrpo.launch.ray.store import Changes, Store, Superseded
+from metrpo.launch.ray.sync import Copy
+from metrpo.launch.ray.worker import Ended, Order
+from metrpo.run import lock
 
 RUN = "Task/k-1/seed-0"
 
@@ -45,8 +45,8 @@ def out(tmp_path):
 def kept(out):
     found = Store(str(out))
     yield found
-    for lock in found._locks.values():
-        lock.close()
+    for held in found._locks.values():
+        held.close()
 
 
 # ---------------------------------------------------------------- the driver's machine
@@ -96,19 +96,19 @@ def test_an_older_attempt_is_refused_and_holds_nothing(kept, out):
     assert (out / RUN / "metrics.csv").read_text() == "second"
     assert not (out / f"{RUN}.log").exists()
     kept.end(RUN, first)
-    with pytest.raises(claim.DirectoryInUse):
-        claim.hold(out / RUN)
+    with pytest.raises(lock.DirectoryInUse):
+        lock.hold(out / RUN)
     kept.end(RUN, second)
     kept.end(RUN, second)
-    claim.hold(out / RUN).close()
+    lock.hold(out / RUN).close()
 
 
 def test_a_run_that_another_process_holds_is_not_given_away(kept, out):
     (out / RUN).mkdir(parents=True)
-    lock = claim.hold(out / RUN)
-    with pytest.raises(claim.DirectoryInUse):
+    held = lock.hold(out / RUN)
+    with pytest.raises(lock.DirectoryInUse):
         kept.begin(RUN)
-    lock.close()
+    held.close()
     assert kept.begin(RUN)[0] == 1
 
 
@@ -165,7 +165,7 @@ class Listener:
     def begin(self, run):
         if self.busy:
             self.busy -= 1
-            raise claim.DirectoryInUse("busy")
+            raise lock.DirectoryInUse("busy")
         return 7, self.files
 
     def take(self, run, attempt, changes):
@@ -226,7 +226,7 @@ def test_what_has_changed_is_sent_once_metrics_last(node, tmp_path):
 def test_first_come_the_files_that_say_what_a_run_directory_is():
     names = ["metrics.csv", "a", "checkpoints/1", "run.json", "episodes/2", "config.json", "z", "diagnostics.csv"]
     order = ["run.json", "config.json", "episodes/2", "checkpoints/1", "a", "diagnostics.csv", "z", "metrics.csv"]
-    assert sorted(names, key=sent.rank) == order
+    assert sorted(names, key=sync.rank) == order
 
 
 @pytest.mark.parametrize("happens", ["written", "deleted", "new"])
@@ -234,7 +234,7 @@ def test_nothing_is_sent_while_the_run_is_writing(node, tmp_path, monkeypatch, h
     listener = Listener()
     copy = Copy(listener, RUN, node, tmp_path / "log")
     put(node, {"checkpoints/1": "1", "metrics.csv": "1"})
-    look = sent.marks
+    look = sync.marks
 
     def looked(directory):
         found = look(directory)
@@ -242,10 +242,10 @@ def test_nothing_is_sent_while_the_run_is_writing(node, tmp_path, monkeypatch, h
             (node / "checkpoints/1").unlink()
         else:
             put(node, {"metrics.csv": "2"} if happens == "written" else {"checkpoints/2": "2"})
-        monkeypatch.setattr(sent, "marks", look)
+        monkeypatch.setattr(sync, "marks", look)
         return found
 
-    monkeypatch.setattr(sent, "marks", looked)
+    monkeypatch.setattr(sync, "marks", looked)
     copy.send()
     assert listener.taken == []
     copy.send()
@@ -287,27 +287,27 @@ def test_a_run_works_in_a_folder_of_its_own(out, tmp_path, monkeypatch):
         attend.directory = directory
         return Ended(0, (), 1.0)
 
-    monkeypatch.setattr(on_node, "attend", attend)
-    monkeypatch.setattr(sent, "_POLL", 0.001)
-    assert sent.attend(order, RUN, listener) == Ended(0, (), 1.0)
+    monkeypatch.setattr(worker, "attend", attend)
+    monkeypatch.setattr(sync, "_POLL", 0.001)
+    assert sync.attend(order, RUN, listener) == Ended(0, (), 1.0)
     assert listener.taken == [changes([("metrics.csv", b"1")], log=b"said")]
     assert listener.ended == [(RUN, 7)]
     assert not attend.directory.exists()
     assert not out.exists()
     listener.busy = 1000
-    monkeypatch.setattr(on_node, "PATIENCE", 0.05)
-    with pytest.raises(claim.DirectoryInUse):
-        sent.attend(order, RUN, listener)
+    monkeypatch.setattr(worker, "PATIENCE", 0.05)
+    with pytest.raises(lock.DirectoryInUse):
+        sync.attend(order, RUN, listener)
 
 
 def test_its_log_comes_back_from_a_process_that_fails(kept, out, tmp_path):
     words = ("train", "Swimer", "--run-dir", str(out / RUN))
     order = Order(words, str(out / RUN), "/nowhere/log", str(tmp_path), {}, 1, 0.0)
-    assert sent.attend(order, RUN, kept).code == 2
+    assert sync.attend(order, RUN, kept).code == 2
     log = (out / f"{RUN}.log").read_text()
     assert log.startswith("metrpo: on ")
     assert "unknown task 'Swimer'" in log
-    claim.hold(out / RUN).close()
+    lock.hold(out / RUN).close()
 
 
 def test_a_run_whose_files_are_not_taken_is_killed(monkeypatch):
@@ -317,7 +317,7 @@ def test_a_run_whose_files_are_not_taken_is_killed(monkeypatch):
         raise Superseded("another goes on")
 
     with pytest.raises(Superseded):
-        on_node._wait(process, look)
+        worker._wait(process, look)
     assert process.returncode == -9
 
 
@@ -331,7 +331,7 @@ def test_the_last_look_is_after_the_end_and_made_again_when_it_is_interrupted():
             raise left.pop()
         looked.append(process.poll())
 
-    assert on_node._wait(process, look) == 0
+    assert worker._wait(process, look) == 0
     assert looked == [0]
 
 
@@ -352,11 +352,11 @@ def test_what_the_store_raises_is_raised_on_the_other_machine(kept, out, monkeyp
     def method(name):
         return SimpleNamespace(remote=lambda *arguments: lambda: getattr(kept, name)(*arguments))
 
-    actor = sent.Actor(SimpleNamespace(begin=method("begin"), take=method("take"), end=method("end")))
+    actor = sync.Actor(SimpleNamespace(begin=method("begin"), take=method("take"), end=method("end")))
     assert actor.begin(RUN) == (1, {})
     actor.take(RUN, 1, changes([("metrics.csv", b"1")]))
     assert (out / RUN / "metrics.csv").read_text() == "1"
     with pytest.raises(Superseded):
         actor.take(RUN, 0, changes())
     actor.end(RUN, 1)
-    claim.hold(out / RUN).close()
+    lock.hold(out / RUN).close()

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from scipy import stats
 
-from metrpo.experiments.statistics import (
+from metrpo.statistics import (
     at_steps,
     caveat,
     fewest_seeds,

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import probe
-from metrpo import cli, stepwise, training
+from metrpo import external, training
+from metrpo.commands import main
 from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError, TaskError
 from metrpo.presets import override, preset
 from metrpo.run import machine
@@ -76,20 +77,20 @@ def uninterrupted(tmp_path_factory):
 
 
 def test_the_steps_one_at_a_time_are_the_loop(uninterrupted, tmp_path):
-    stepwise.begin(config(), tmp_path)
+    external.begin(config(), tmp_path)
     assert load_policy(tmp_path).info.iteration == 0
     for _ in range(2):
-        waiting = stepwise.collect(tmp_path)
+        waiting = external.collect(tmp_path)
         assert sum(len(e.rewards) for e in waiting) == 100
-        row = stepwise.improve(tmp_path)
+        row = external.improve(tmp_path)
     assert row["iteration"] == 2
     assert result(tmp_path) == result(uninterrupted)
 
 
 def test_steps_and_the_loop_take_turns(uninterrupted, tmp_path):
-    stepwise.begin(config(), tmp_path)
+    external.begin(config(), tmp_path)
     train(dataclasses.replace(config(), iterations=1), tmp_path)
-    stepwise.collect(tmp_path, at_least=40)  # the loop plays the rest
+    external.collect(tmp_path, at_least=40)  # the loop plays the rest
     train(config(), tmp_path)
     assert result(tmp_path) == result(uninterrupted)
 
@@ -115,7 +116,7 @@ def test_a_broken_environment_ends_with_how_to_go_on(tmp_path, monkeypatch, caps
     monkeypatch.setattr(training, "_measure_yardsticks", lambda *_: None)  # its episodes would be the broken ones
     monkeypatch.setattr(Fragile, "left", 3)
     command = ["train", "Probe", "--trust-reward", "--collect.steps", "100", "--run-dir", str(tmp_path / "run")]
-    assert cli.main(command) == 2
+    assert main.main(command) == 2
     err = capsys.readouterr().err
     assert "metrpo: collect, iteration 1: the motor is hot" in err
     assert "run keeps every finished iteration and real episode. The same command goes on." in err
@@ -140,15 +141,15 @@ def test_a_damaged_checkpoint_costs_its_iteration_and_no_real_episode(uninterrup
 
 def test_only_another_program_plays(tmp_path):
     asked = config("Elsewhere")
-    stepwise.begin(asked, tmp_path)
+    external.begin(asked, tmp_path)
     with pytest.raises(RunDirectoryError, match="expected episodes to learn from, got none"):
-        stepwise.improve(tmp_path)
+        external.improve(tmp_path)
     with pytest.raises(TaskError, match="Elsewhere: expected an environment, got none"):
-        stepwise.collect(tmp_path)
+        external.collect(tmp_path)
     for seed in range(5):
         states, actions, rewards = probe.rollout(probe.PROBE, seed, lambda t, s: np.sin([t + s[0], t * s[1]]))
         append_episode(tmp_path, states, actions, rewards, terminated=False)
-    row = stepwise.improve(tmp_path)
+    row = external.improve(tmp_path)
     assert row["real_steps"] == 100
     assert math.isnan(row["return_real"])
     assert row["return_collected"] < 0
@@ -157,11 +158,11 @@ def test_only_another_program_plays(tmp_path):
 
 
 def test_a_log_from_elsewhere_can_be_added(tmp_path):
-    stepwise.begin(config("Elsewhere"), tmp_path / "run")
+    external.begin(config("Elsewhere"), tmp_path / "run")
     states, actions, rewards = probe.rollout(probe.PROBE, 0, lambda t, s: -s)
     log = {"states": states[:-1], "next_states": states[1:], "actions": actions, "rewards": rewards}
     np.savez(tmp_path / "log.npz", **log, terminated=np.zeros(len(rewards)))
-    waiting = stepwise.collect(tmp_path / "run", data=tmp_path / "log.npz")
+    waiting = external.collect(tmp_path / "run", data=tmp_path / "log.npz")
     assert len(waiting) == 1
     np.testing.assert_allclose(waiting[0].states, states, rtol=1e-6)
 
@@ -169,35 +170,35 @@ def test_a_log_from_elsewhere_can_be_added(tmp_path):
 @pytest.mark.parametrize("setting", [{"validate.rule": "real"}, {"imagine.start": "reset"}])
 def test_what_needs_an_environment_is_refused_without_one(tmp_path, setting):
     with pytest.raises(ConfigError, match="Elsewhere: expected an environment for"):
-        stepwise.begin(config("Elsewhere", **setting), tmp_path)
+        external.begin(config("Elsewhere", **setting), tmp_path)
 
 
 def test_what_the_budget_leaves_is_collected_and_more_only_when_asked_for(tmp_path):
-    stepwise.begin(dataclasses.replace(config(), real_steps=33), tmp_path)
-    waiting = stepwise.collect(tmp_path)
+    external.begin(dataclasses.replace(config(), real_steps=33), tmp_path)
+    waiting = external.collect(tmp_path)
     assert sum(len(e.rewards) for e in waiting) == 33
-    assert len(stepwise.collect(tmp_path)) == len(waiting)
-    assert sum(len(e.rewards) for e in stepwise.collect(tmp_path, at_least=50)) >= 50
-    stepwise.improve(tmp_path)
+    assert len(external.collect(tmp_path)) == len(waiting)
+    assert sum(len(e.rewards) for e in external.collect(tmp_path, at_least=50)) >= 50
+    external.improve(tmp_path)
     with pytest.raises(ConfigError, match=r"budget of .*, 33, is spent; .* metrpo collect .* --steps \d+"):
-        stepwise.collect(tmp_path)
+        external.collect(tmp_path)
 
 
 def test_a_run_is_begun_once(tmp_path):
-    stepwise.begin(config(), tmp_path)
+    external.begin(config(), tmp_path)
     with pytest.raises(RunDirectoryError, match="holds a run already"):
-        stepwise.begin(config(), tmp_path)
+        external.begin(config(), tmp_path)
     with pytest.raises(ConfigError, match="expected one that learns models, got ppo"):
-        stepwise.begin(dataclasses.replace(config(), method="ppo", system="ppo"), tmp_path / "other")
-    for step in (stepwise.collect, stepwise.improve):
+        external.begin(dataclasses.replace(config(), method="ppo", system="ppo"), tmp_path / "other")
+    for step in (external.collect, external.improve):
         with pytest.raises(RunDirectoryError, match=r"holds no run: .* metrpo init TASK"):
             step(tmp_path / "nothing")
 
 
 def test_a_stale_lock_holder_is_not_disturbed(tmp_path):
-    stepwise.begin(config(), tmp_path)
+    external.begin(config(), tmp_path)
     with RunDirectory(tmp_path, config()), pytest.raises(MetrpoError, match="in use"):
-        stepwise.improve(tmp_path)
+        external.improve(tmp_path)
 
 
 def test_the_commands(tmp_path, monkeypatch, capsys):
@@ -209,16 +210,16 @@ def test_the_commands(tmp_path, monkeypatch, capsys):
         words = [str(v) for v in value] if isinstance(value, tuple) else [str(value)]
         typed += [f"--{name.replace('_', '-')}", *words]
     run_dir = str(tmp_path / "run")
-    assert cli.main(["init", "Probe", "--run-dir", run_dir, *typed]) == 0
+    assert main.main(["init", "Probe", "--run-dir", run_dir, *typed]) == 0
     assert "untrained policy" in capsys.readouterr().out
-    assert cli.main(["collect", run_dir, "--steps", "60", "--json"]) == 0
+    assert main.main(["collect", run_dir, "--steps", "60", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["episodes"], found["steps"]) == (3, 60)
-    assert cli.main(["improve", run_dir, "--json"]) == 0
+    assert main.main(["improve", run_dir, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["real_steps"] == 60
-    assert cli.main(["collect", run_dir, "--steps", "0"]) == 2
+    assert main.main(["collect", run_dir, "--steps", "0"]) == 2
     assert "steps: expected at least 1, got 0" in capsys.readouterr().err
-    assert cli.main(["improve", str(tmp_path / "none")]) == 2
+    assert main.main(["improve", str(tmp_path / "none")]) == 2
     assert "holds no run" in capsys.readouterr().err
 
 
@@ -226,7 +227,7 @@ def test_the_robot_of_the_example_hands_over_what_it_saw(tmp_path, monkeypatch):
     monkeypatch.setattr(machine, "prepare", lambda *_, **__: None)
     few = ["--ensemble.hidden", "8", "--fit.max-steps", "20", "--imagine.steps", "600", "--validate.max-updates", "5"]
     run_dir = tmp_path / "arm"
-    assert cli.main(["init", f"{ROBOT / 'arm.py'}:task", "--run-dir", str(run_dir), *few]) == 0
+    assert main.main(["init", f"{ROBOT / 'arm.py'}:task", "--run-dir", str(run_dir), *few]) == 0
     command = [sys.executable, str(ROBOT / "robot.py"), str(run_dir), "--rounds", "1", "--episodes", "3"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

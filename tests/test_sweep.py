@@ -7,12 +7,13 @@ import hashlib
 
 import pytest
 
-from metrpo import cli, options
+from metrpo.commands import main, options
+from metrpo.commands.sweep_typed import as_typed
 from metrpo.config import Config
 from metrpo.errors import ConfigError, TaskError
-from metrpo.experiments import reproduce, sweep
-from metrpo.experiments.means import Means
-from metrpo.experiments.sweep import Grid, from_file, seeds_of, values_of
+from metrpo.launch import dispatch, grid
+from metrpo.launch.backend import Means
+from metrpo.launch.grid import Grid, from_file, seeds_of, values_of
 from metrpo.run import machine
 
 GRID = Grid(
@@ -60,8 +61,8 @@ def test_a_combination_with_a_long_name_has_a_folder_that_every_disk_takes(tmp_p
     assert len(set(folders)) == 2, "what is cut off still counts"
     for run in runs:
         (tmp_path / run.name).mkdir(parents=True)
-    assert sweep._variant("k-1", (("a", "é" * 124 + "b"),)) == "k-1,a=" + "é" * 124 + "b", "255 bytes"
-    assert sweep._variant("k-10", (("a", "é" * 125),)).startswith("k-10,a=" + "é" * 86 + ","), "no half letters"
+    assert grid._variant("k-1", (("a", "é" * 124 + "b"),)) == "k-1,a=" + "é" * 124 + "b", "255 bytes"
+    assert grid._variant("k-10", (("a", "é" * 125),)).startswith("k-10,a=" + "é" * 86 + ","), "no half letters"
 
 
 def test_what_is_run_is_what_the_grid_says(monkeypatch):
@@ -73,7 +74,7 @@ def test_what_is_run_is_what_the_grid_says(monkeypatch):
 
 def told(line):
     """The grid of a command line."""
-    return sweep.as_typed(options.parse(["sweep", *line.split()]))
+    return as_typed(options.parse(["sweep", *line.split()]))
 
 
 @pytest.mark.parametrize(
@@ -208,11 +209,11 @@ def test_the_command_runs_the_grid_and_says_how_it_ended(tmp_path, monkeypatch, 
         asked.append((len(runs), out, means))
         return runs[:1]
 
-    monkeypatch.setattr(reproduce, "reproduce", two_of_three)
+    monkeypatch.setattr(dispatch, "reproduce", two_of_three)
     command = ["sweep", "--set", "ensemble.members=1,5", "--seeds", "0:2", "--jobs", "3", "--out", str(tmp_path)]
-    assert cli.main(command) == 1
+    assert main.main(command) == 1
     assert "1 of 4 runs failed" in capsys.readouterr().err
     assert asked == [(4, tmp_path, Means(jobs=3))]
-    assert cli.main([*command, "--dry-run"]) == 0
+    assert main.main([*command, "--dry-run"]) == 0
     assert capsys.readouterr().out.count("metrpo train Swimmer") == 4
     assert len(asked) == 1

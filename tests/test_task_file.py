@@ -11,13 +11,13 @@ import gymnasium
 import pytest
 
 from helpers import random_policy
-from metrpo import cli
+from metrpo.commands import main
 from metrpo.config import to_json
 from metrpo.errors import ConfigError, TaskError
+from metrpo.external import begin
 from metrpo.presets import override, preset
 from metrpo.run.policy_file import save_policy
 from metrpo.run.task_file import moved, remember, task_of_run
-from metrpo.stepwise import begin
 from metrpo.training import train
 from metrpo.world import resolve
 from metrpo.world.registry import get_task
@@ -123,7 +123,7 @@ def a_run(run_dir, task):
 
 
 def evaluated(capsys, *arguments):
-    code = cli.main(["evaluate", "--episodes", "1", "--json", *arguments])
+    code = main.main(["evaluate", "--episodes", "1", "--json", *arguments])
     out, err = capsys.readouterr()
     return code, json.loads(out)["task"] if out else err
 
@@ -212,9 +212,9 @@ def test_every_command_that_plays_or_learns_takes_the_place_anew(command, monkey
     monkeypatch.setattr("metrpo.run.machine.prepare", lambda *_, **__: None)
     made = []
     monkeypatch.setattr(resolve, "task_of", lambda make, *_, **__: made.append(make.__module__) or raising())
-    assert cli.main([command, "run"]) == 2
+    assert main.main([command, "run"]) == 2
     assert "mine.py:make: expected a Python file at" in capsys.readouterr().err
-    assert cli.main([command, "run", "--task", "there/moved.py:make"]) == 2
+    assert main.main([command, "run", "--task", "there/moved.py:make"]) == 2
     assert "far enough" in capsys.readouterr().err
     assert [name.startswith("metrpo_task_moved") for name in made] == [True]
 
@@ -224,17 +224,17 @@ def test_the_error_names_the_task_that_was_tried(command, capsys):
     write("mine.py", MAKE, horizon=5)
     a_run(Path("run"), "mine.py:make")
     Path("run/config.json").write_text(to_json(preset("mine.py:make")))
-    assert cli.main([command, "run", "--task", "nofile.py:task"]) == 2
+    assert main.main([command, "run", "--task", "nofile.py:task"]) == 2
     said = capsys.readouterr().err
     assert said.startswith("metrpo: nofile.py:task: expected a Python file at ")
     assert "--task" not in said, "that is where it was tried"
-    assert cli.main([command, "run", "--task", "Swimer"]) == 2
+    assert main.main([command, "run", "--task", "Swimer"]) == 2
     assert "unknown task 'Swimer'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["train", "init"])
 def test_a_new_run_is_not_told_of_an_option_that_its_command_lacks(command, capsys):
-    assert cli.main([command, "nofile.py:task"]) == 2
+    assert main.main([command, "nofile.py:task"]) == 2
     said = capsys.readouterr().err
     assert "nofile.py:task: expected a Python file at " in said
     assert "--task" not in said
@@ -253,11 +253,11 @@ def test_init_names_only_what_can_add_episodes_to_its_task(monkeypatch, capsys):
         task = dataclasses.replace(metrpo.tasks()["Swimmer"], name="arm", env_id=None)
     """,
     )
-    monkeypatch.setattr("metrpo.stepwise.begin", lambda *_: None)
-    assert cli.main(["init", "arm.py:task", "--run-dir", "my arm"]) == 0
+    monkeypatch.setattr("metrpo.external.begin", lambda *_: None)
+    assert main.main(["init", "arm.py:task", "--run-dir", "my arm"]) == 0
     said = "add episodes (metrpo.append_episode, or metrpo collect 'my arm' --data FILE), then"
     assert said in capsys.readouterr().out
-    assert cli.main(["init", "Swimmer", "--run-dir", "swim"]) == 0
+    assert main.main(["init", "Swimmer", "--run-dir", "swim"]) == 0
     assert "add episodes (metrpo collect swim), then" in capsys.readouterr().out
 
 

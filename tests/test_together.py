@@ -16,8 +16,9 @@ from helpers import random_policy
 from metrpo.baselines import on_policy
 from metrpo.errors import DivergedError, EpisodeError, TaskError
 from metrpo.policy import gaussian
-from metrpo.world import collect, mujoco, together
+from metrpo.world import batch_episodes, collect
 from metrpo.world.registry import get_task
+from metrpo.world.tasks import rllab
 
 NAMES = ["Swimmer", "Snake", "Hopper", "HopperUpright", "HalfCheetah", "Ant", "Humanoid", "HumanoidStandup"]
 
@@ -39,8 +40,8 @@ def noisy(task, std=1.0):
 def test_side_by_side_is_the_environment_step_by_step(name):
     """Same states, rewards and ends to the last bit, contacts and their solver's warm start included."""
     task = get_task(name)
-    assert together.applies(task)
-    episodes = together.play(task, noisy(task), iter(range(3)), threads=2)
+    assert batch_episodes.applies(task)
+    episodes = batch_episodes.play(task, noisy(task), iter(range(3)), threads=2)
     assert len(episodes) == 3
     for seed, episode in enumerate(episodes):
         env = task.make_env()
@@ -83,8 +84,8 @@ def one_after_another(task, seeds, at_least, longest=None):
 def test_as_many_episodes_as_one_after_another(monkeypatch, slots, at_least, longest):
     """Ant's end early: the next begins when those before it cannot have enough steps, and none is left unfinished."""
     task = get_task("Ant")
-    monkeypatch.setattr(together, "SLOTS", slots)
-    got = together.play(task, noisy(task, 3.0), itertools.count(7), at_least, longest)
+    monkeypatch.setattr(batch_episodes, "SLOTS", slots)
+    got = batch_episodes.play(task, noisy(task, 3.0), itertools.count(7), at_least, longest)
     plain = one_after_another(task, itertools.count(7), at_least, longest)
     assert len({e.terminated for e in plain}) == 2 or at_least < 450, "the case must have early ends and late ones"
     assert sum(len(e.rewards) for e in plain[:-1]) < at_least <= sum(len(e.rewards) for e in plain)
@@ -96,7 +97,7 @@ def test_as_many_episodes_as_one_after_another(monkeypatch, slots, at_least, lon
 def test_drawn_episodes_do_not_depend_on_how_many_run_at_a_time(monkeypatch):
     task, policy = get_task("Ant"), random_policy(0, 29, 8, std=1.0)
     many = on_policy.collect(task, policy, 400, np.random.default_rng(3))
-    monkeypatch.setattr(together, "SLOTS", 2)
+    monkeypatch.setattr(batch_episodes, "SLOTS", 2)
     few = on_policy.collect(task, policy, 400, np.random.default_rng(3))
     assert len(few.episodes) == len(many.episodes) >= 4
     for a, b in zip(many.episodes, few.episodes, strict=True):
@@ -116,29 +117,31 @@ def test_returns_are_those_of_the_plain_evaluation(name):
     task = get_task(name)
     act = partial(gaussian.mean, random_policy(1, task.state_size, task.action_size))
     expected = collect.evaluate(task, act, 5, seed=4)
-    np.testing.assert_array_equal(together.evaluate(task, act, 5, seed=4), expected)
+    np.testing.assert_array_equal(batch_episodes.evaluate(task, act, 5, seed=4), expected)
     assert len(set(expected)) == 5
 
 
 def test_any_other_environment_is_played_one_after_another():
     act = partial(gaussian.mean, random_policy(1, 2, 2))
     for task in (probe.PROBE, probe.ENDING_PROBE, dataclasses.replace(get_task("Swimmer"), make=probe.ProbeEnv)):
-        assert not together.applies(task)
+        assert not batch_episodes.applies(task)
     for task in (probe.PROBE, probe.ENDING_PROBE):
-        np.testing.assert_array_equal(together.evaluate(task, act, 6, seed=4), collect.evaluate(task, act, 6, seed=4))
+        np.testing.assert_array_equal(
+            batch_episodes.evaluate(task, act, 6, seed=4), collect.evaluate(task, act, 6, seed=4)
+        )
 
 
 def test_steps_are_told_and_the_evaluation_has_its_bound():
     task, told = get_task("Swimmer"), []
-    together.play(task, noisy(task), itertools.count(), 250, 100, told.append)
+    batch_episodes.play(task, noisy(task), itertools.count(), 250, 100, told.append)
     assert told == [*range(3, 301, 3)]
     act = partial(gaussian.mean, random_policy(1, task.state_size, task.action_size))
     np.testing.assert_array_equal(
-        together.evaluate(task, act, 9, 4, at_most=350), collect.evaluate(task, act, 9, 4, at_most=350)
+        batch_episodes.evaluate(task, act, 9, 4, at_most=350), collect.evaluate(task, act, 9, 4, at_most=350)
     )
-    short = together.evaluate(task, act, 3, 4, longest=5)
+    short = batch_episodes.evaluate(task, act, 3, 4, longest=5)
     np.testing.assert_array_equal(short, collect.evaluate(task, act, 3, 4, longest=5))
-    assert not np.array_equal(short, together.evaluate(task, act, 3, 4))
+    assert not np.array_equal(short, batch_episodes.evaluate(task, act, 3, 4))
 
 
 @pytest.mark.parametrize("at_most", [1, 90, 400])
@@ -156,15 +159,15 @@ def test_what_is_not_a_number_is_named():
         return np.where((numbers[:, None] == 1) & (steps[:, None] == 3), np.nan, 0.0) + np.zeros((len(states), 2))
 
     with pytest.raises(DivergedError, match="Swimmer: step 3 of an episode: expected numbers as action"):
-        together.play(task, act, iter(range(3)))
+        batch_episodes.play(task, act, iter(range(3)))
     with pytest.raises(
         TaskError, match=r"Swimmer: step 0 of an episode: expected an action of 2 numbers, got shape \[3"
     ):
-        together.play(task, lambda states, numbers, steps: np.zeros((len(states), 3)), iter([0]))
+        batch_episodes.play(task, lambda states, numbers, steps: np.zeros((len(states), 3)), iter([0]))
 
 
 def test_a_simulation_that_diverges_is_named(monkeypatch):
-    advance = mujoco.MujocoTask.advance
+    advance = rllab.MujocoTask.advance
 
     def diverged(self, controls):
         state = advance(self, controls)
@@ -172,7 +175,7 @@ def test_a_simulation_that_diverges_is_named(monkeypatch):
             state[1] = np.inf
         return state
 
-    monkeypatch.setattr(mujoco.MujocoTask, "advance", diverged)
+    monkeypatch.setattr(rllab.MujocoTask, "advance", diverged)
     act = lambda states, numbers, steps: np.where(steps[:, None] == 2, 1.0, 0.0) * np.ones((len(states), 2))  # noqa: E731
     with pytest.raises(EpisodeError, match=r"Swimmer: the simulation diverged \(at step 2 of an episode\)"):
-        together.play(get_task("Swimmer"), act, iter([0]))
+        batch_episodes.play(get_task("Swimmer"), act, iter([0]))

@@ -12,9 +12,10 @@ from jax.flatten_util import ravel_pytree
 
 from helpers import on_host, random_policy, slow_mean
 from metrpo.config import TRPOConfig
-from metrpo.policy import gaussian, linearised, trpo
-from metrpo.policy.batch import Batch
-from metrpo.policy.linearised import chunked, linearise
+from metrpo.policy import gaussian
+from metrpo.policy.improvers import linearised, trpo
+from metrpo.policy.improvers.batch import Batch
+from metrpo.policy.improvers.linearised import chunked, linearise
 
 COUNT, STATE, ACTION = 24, 4, 2
 CONFIG = TRPOConfig()

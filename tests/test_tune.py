@@ -17,20 +17,21 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from metrpo import cli, options
+from metrpo.commands import main, options
+from metrpo.commands.tune_typed import as_typed
 from metrpo.config import to_json
+from metrpo.console.interrupt import Stopped
 from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError, TaskError
-from metrpo.experiments import tune as tuning
-from metrpo.experiments import workers
-from metrpo.experiments.draw_tuned import draw
-from metrpo.experiments.search import Search, as_typed, from_file, worth
-from metrpo.experiments.space import Choices, Range, span_of
-from metrpo.experiments.study import FILE
-from metrpo.experiments.tune import tune
-from metrpo.experiments.tuned import ENOUGH
-from metrpo.run.claim import hold
-from metrpo.run.interrupt import Stopped
+from metrpo.launch import processes
+from metrpo.run.lock import hold
 from metrpo.run.metrics import read_metrics, to_csv
+from metrpo.tune import trials as tuning
+from metrpo.tune.picture import draw
+from metrpo.tune.results import ENOUGH
+from metrpo.tune.search import Search, from_file, worth
+from metrpo.tune.space import Choices, Range, span_of
+from metrpo.tune.study import FILE
+from metrpo.tune.trials import tune
 from tiny_run import SMALL
 
 SPACE = {"trpo.max_kl": Range(0.001, 1.0, log=True), "ensemble.members": Choices((1, 3, 5))}
@@ -447,14 +448,14 @@ def faked(monkeypatch):
 
 
 def test_the_command_ends_with_a_table_a_picture_and_the_best_command(tmp_path, faked, capsys, monkeypatch):
-    assert cli.main(command(tmp_path)) == 0
+    assert main.main(command(tmp_path)) == 0
     said = capsys.readouterr().out
     assert "6 trials: " in said
     assert "the preset's own" in said
     best = next(line.strip() for line in said.splitlines() if line.startswith("  metrpo train"))
     assert (tmp_path / "tune.png").read_bytes().startswith(b"\x89PNG")
     faked.begun.clear()
-    assert cli.main(command(tmp_path, "--json")) == 0
+    assert main.main(command(tmp_path, "--json")) == 0
     out, err = capsys.readouterr()
     record = json.loads(out)
     assert (record["best"]["command"], len(record["trials"]), faked.begun) == (best, 6, [])
@@ -466,7 +467,7 @@ def test_the_command_ends_with_a_table_a_picture_and_the_best_command(tmp_path, 
 
 
 def test_a_dry_run_writes_nothing(tmp_path, faked, capsys):
-    assert cli.main(command(tmp_path / "none", "--dry-run")) == 0
+    assert main.main(command(tmp_path / "none", "--dry-run")) == 0
     said = capsys.readouterr().out
     assert "trpo.max_kl = log 0.001..1.0 (the preset has 0.01)" in said
     assert "metrpo train Swimmer --system me-trpo" in said
@@ -476,7 +477,7 @@ def test_a_dry_run_writes_nothing(tmp_path, faked, capsys):
 
 def test_failures_are_in_the_exit_code(tmp_path, faked, capsys):
     faked.fails = ("trial-002/seed-0",)
-    assert cli.main(command(tmp_path)) == 1
+    assert main.main(command(tmp_path)) == 1
     assert "1 of 6 trials failed" in capsys.readouterr().err
 
 
@@ -486,7 +487,7 @@ def test_a_signal_is_in_the_exit_code(tmp_path, faked, monkeypatch, capsys, erro
         raise error
 
     monkeypatch.setattr(tuning, "tune", stopped)
-    assert cli.main(command(tmp_path)) == code
+    assert main.main(command(tmp_path)) == code
     assert "The same command goes on" in capsys.readouterr().err
 
 
@@ -513,7 +514,7 @@ def test_every_kind_of_setting_is_drawn_and_shown(tmp_path, capsys):
 HOLDS = """
 import sys, time
 from pathlib import Path
-from metrpo.run.claim import hold
+from metrpo.run.lock import hold
 with hold(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)
@@ -529,12 +530,12 @@ def test_a_run_that_survived_its_tune_is_watched_stopped_and_taken_over(tmp_path
         started.append((run, out, cores))
         return FakeWorker(Fake(), run, out)
 
-    monkeypatch.setattr(workers, "start", begun)
+    monkeypatch.setattr(processes, "start", begun)
     for asked in (True, False):
         held = subprocess.Popen([sys.executable, "-c", HOLDS, str(directory)], stdout=subprocess.PIPE, text=True)
         try:
             assert held.stdout.readline() == "held\n"
-            orphan = workers.begin(run, tmp_path, (0,))
+            orphan = processes.begin(run, tmp_path, (0,))
             assert orphan.poll() is None
             assert started == []
             if asked:
@@ -592,9 +593,9 @@ def test_killed_together_with_its_run_it_goes_on_from_the_checkpoint(tmp_path):
     assert made in ([f"iteration {n}/3" for n in (1, 2, 3)], [f"iteration {n}/3" for n in (2, 3)]), "one was made again"
     page = tmp_path / "page.html"
     for words in (["report", str(out), "--out", str(page)], ["watch", str(out), "--once"]):
-        assert cli.main(words) == 0
+        assert main.main(words) == 0
     assert "trial-000" in page.read_text()
-    assert cli.main(["plot", str(out), "--out", str(tmp_path / "curves.png")]) == 0
+    assert main.main(["plot", str(out), "--out", str(tmp_path / "curves.png")]) == 0
 
 
 # ---------------------------------------------------------------- the committed search

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from metrpo import cli
+from metrpo.commands import main
 from metrpo.run import machine
 from metrpo.run.metrics import read_metrics
 
@@ -45,12 +45,12 @@ def test_it_has_forty_lines_of_code():
 
 def test_every_command_works_and_the_policy_drives(there, capsys):
     train, evaluate, export = commands()
-    assert cli.main([*train, *FEW, "--evaluation-episodes", "1", "--no-video"]) == 0
+    assert main.main([*train, *FEW, "--evaluation-episodes", "1", "--no-video"]) == 0
     rows = read_metrics(there / "runs" / "cart" / "metrics.csv")
     assert rows[-1]["real_steps"] >= 3000
-    assert cli.main(evaluate) == 0
+    assert main.main(evaluate) == 0
     assert "cart.py:task: return" in capsys.readouterr().out
-    assert cli.main(export) == 0
+    assert main.main(export) == 0
     done = subprocess.run([sys.executable, "drive.py"], capture_output=True, text=True)
     force = np.array(done.stdout.strip(" []\n").split(), float)
     assert done.returncode == 0, done.stderr
@@ -62,6 +62,6 @@ def test_every_command_works_and_the_policy_drives(there, capsys):
 @pytest.mark.timeout(900)
 def test_the_cart_is_brought_to_the_middle(there):
     """As the tutorial has it, 3,000 real steps: -10 when measured. No force earns -108, a tuned PD controller -4.4."""
-    assert cli.main([*commands()[0], "--no-video"]) == 0
+    assert main.main([*commands()[0], "--no-video"]) == 0
     rows = read_metrics(there / "runs" / "cart" / "metrics.csv")
     assert rows[-1]["return_real"] > -15

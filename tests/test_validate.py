@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from metrpo.config import ValidateConfig
-from metrpo.policy.validate import RULES, Evidence, fraction_improved, most_improve
+from metrpo.policy.stopping import RULES, Evidence, fraction_improved, most_improve
 
 CONFIG = ValidateConfig()
 nan, inf = np.nan, np.inf

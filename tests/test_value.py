@@ -12,10 +12,11 @@ from hypothesis import strategies as st
 
 import probe
 from helpers import linear_ensemble, on_host, random_policy
-from metrpo import algorithm, phase
+from metrpo import algorithm, policy_phase
 from metrpo.config import AdvantageConfig, Config
-from metrpo.policy import advantage, value
-from metrpo.policy.improve import batch_of, init_baseline, init_memory
+from metrpo.policy import advantage
+from metrpo.policy.improvers.table import batch_of, init_baseline, init_memory
+from metrpo.policy.value import linear, network
 from metrpo.presets import override
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.types import Trajectories
@@ -24,14 +25,14 @@ KEY = jax.random.key(0)
 N, T, E, S = 500, 5, 100, 2
 """Rows, and batches of T steps of E episodes, always of the same shape: compiling takes longer than all else here."""
 QUICK = AdvantageConfig("network", 0.9, 0.95, value_hidden=(24,), value_batch_size=100, value_learning_rate=1e-2)
-predict, fit = on_host()(value.predict), on_host(static_argnames="config")(value.fit)
-advantages_and_value = on_host(static_argnames=("config", "cut"))(value.advantages_and_value)
+predict, fit = on_host()(network.predict), on_host(static_argnames="config")(network.fit)
+advantages_and_value = on_host(static_argnames=("config", "cut"))(network.advantages_and_value)
 gae = on_host()(advantage.gae)
 ONES = np.ones(N, np.float32)
 
 
 def fresh(size=S, config=QUICK):
-    return jax.device_get(value.init(KEY, size, config))
+    return jax.device_get(network.init(KEY, size, config))
 
 
 def explained(predicted, truth):
@@ -94,7 +95,7 @@ def test_prediction_is_the_network_in_its_units():
 @pytest.mark.parametrize("timeless", [False, True])
 def test_inputs_are_the_states_and_the_time(timeless):
     states = rows(3).reshape(20, -1, 3)
-    got = value.inputs(states, timeless)
+    got = network.inputs(states, timeless)
     np.testing.assert_allclose(got, timed(states, timeless), atol=1e-6)
 
 
@@ -277,7 +278,7 @@ DEVICES = 4
 
 
 def share(now, x, targets, mask, key):
-    return value.fit(now, x, targets, mask, QUICK, key, "devices")
+    return network.fit(now, x, targets, mask, QUICK, key, "devices")
 
 
 together = on_host()(jax.vmap(share, (None, 0, 0, 0, None), axis_name="devices"))
@@ -326,18 +327,18 @@ def test_the_setting_chooses_the_baseline(monkeypatch):
         calls.append((baseline, *given))
         return rollouts.rewards, "refitted"
 
-    monkeypatch.setattr(value, "advantages_and_value", record)
-    monkeypatch.setattr(advantage, "advantages_and_baseline", record)
+    monkeypatch.setattr(network, "advantages_and_value", record)
+    monkeypatch.setattr(linear, "advantages_and_value", record)
     settings = {"advantage.discount": 0.9, "advantage.gae_lambda": 0.8, "advantage.ridge": 0.1}
-    linear = override(Config("Probe"), settings)
-    network = override(linear, {"advantage.baseline": "network", "imagine.horizon": T})
-    for config in (linear, network):
+    plain = override(Config("Probe"), settings)
+    deep = override(plain, {"advantage.baseline": "network", "imagine.horizon": T})
+    for config in (plain, deep):
         batch, refitted = batch_of(config, a_batch(5), "before", KEY, "devices")
         np.testing.assert_array_equal(batch.advantages.reshape(E, T).T, a_batch(5).rewards)
         assert refitted == "refitted"
-    assert calls == [("before", 0.9, 0.8, 0.1, "devices", False), ("before", network.advantage, KEY, "devices", True)]
-    np.testing.assert_array_equal(init_baseline(linear, S, KEY), advantage.init_baseline(S))
-    assert_same(init_baseline(network, S, KEY), value.init(KEY, S, network.advantage))
+    assert calls == [("before", 0.9, 0.8, 0.1, "devices", False), ("before", deep.advantage, KEY, "devices", True)]
+    np.testing.assert_array_equal(init_baseline(plain, S, KEY), linear.init(S))
+    assert_same(init_baseline(deep, S, KEY), network.init(KEY, S, deep.advantage))
     # What a policy phase leaves is what the next one starts with.
     now = fresh()
     assert init_memory(network, None, now).baseline is now
@@ -353,7 +354,7 @@ def test_a_checkpoint_brings_the_network_back(tmp_path):
     assert jax.tree.structure(loaded.baseline) == jax.tree.structure(state.baseline)
     assert_same(loaded.baseline, changed)
     # A linear baseline is one array by this name, as it was before there were networks.
-    save_state(tmp_path / "linear.npz", state._replace(baseline=advantage.init_baseline(S)), {"metrpo": "0"})
+    save_state(tmp_path / "linear.npz", state._replace(baseline=linear.init(S)), {"metrpo": "0"})
     with np.load(tmp_path / "linear.npz") as file:
         assert [n for n in file.files if "baseline" in n] == [".baseline"]
 
@@ -366,11 +367,11 @@ def test_the_probe_is_learned_from_a_quarter_of_its_episodes():
     policy = random_policy(0, 2, 2, (), scale=0.3, std=0.5)
     pool, tests = np.split(np.random.default_rng(0).uniform(-0.7, 0.7, (60 * 120 + 50, 2)).astype(np.float32), [-50])
     memory = init_memory(config, policy, fresh())
-    new, after, (info, _) = phase._updates(
+    new, after, (info, _) = policy_phase._updates(
         probe.PROBE, config, ensemble, policy, memory, pool.reshape(60, 120, 2), jax.random.key(1)
     )
     optimum = -np.mean(np.sum(tests @ probe.riccati()[0] * tests, axis=1))
-    before, reached = (phase.values_of(probe.PROBE, ensemble, p, tests)[0] for p in (policy, new))
+    before, reached = (policy_phase.values_of(probe.PROBE, ensemble, p, tests)[0] for p in (policy, new))
     assert before < 15 * optimum
     assert 1.3 * optimum < reached < 0.999 * optimum
     assert np.all(info.accepted)

@@ -148,7 +148,7 @@ def cannot_load(self, name, *rest, **more):
     load(self, name, *rest, **more)
 ctypes.CDLL.__init__ = cannot_load
 ctypes.util.find_library = lambda name: None if absent(name) else find(name)
-from metrpo.cli import main
+from metrpo.commands.main import main
 for command in (["tasks"], ["doctor"], ["render", sys.argv[1], "--out", "v.gif"]):
     print("exit code", main(command), flush=True)
 from metrpo import cli

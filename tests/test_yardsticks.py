@@ -8,10 +8,10 @@ import pytest
 
 import probe
 from metrpo import training
+from metrpo.console.progress import Progress
 from metrpo.errors import TaskError
-from metrpo.run import yardsticks
+from metrpo.run import yardstick_record
 from metrpo.run.directory import RunDirectory
-from metrpo.run.progress import Progress
 from metrpo.types import Episode
 from metrpo.world import registry
 from metrpo.world import yardsticks as world
@@ -69,7 +69,7 @@ def test_a_run_measures_them_once_keeps_and_says_them(tmp_path):
     with RunDirectory(tmp_path / "run", CONFIG) as run:
         run.begin(training.init(CONFIG))
     training.train(CONFIG, tmp_path / "run", heard)
-    kept = yardsticks.kept(tmp_path / "run")
+    kept = yardstick_record.kept(tmp_path / "run")
     assert set(kept) == {"doing nothing", "random actions"}
     said = [line for line in heard.lines if line.startswith("doing nothing earns")]
     assert len(said) == 1
@@ -106,11 +106,11 @@ def test_an_environment_that_fails_there_costs_a_warning(tmp_path, monkeypatch, 
     monkeypatch.setattr(training, "measure", broken)
     training.train(CONFIG, tmp_path / "run")
     assert "the motor is off" in caplog.text
-    assert yardsticks.kept(tmp_path / "run") == {}
+    assert yardstick_record.kept(tmp_path / "run") == {}
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"yardsticks": 3}', '{"yardsticks": {"zero": {"mean": "x"}}}'])
 def test_a_run_without_them_has_none(tmp_path, text):
     (tmp_path / "run.json").write_text(text)
-    assert yardsticks.kept(tmp_path) == {}
-    assert yardsticks.kept(tmp_path / "nowhere") == {}
+    assert yardstick_record.kept(tmp_path) == {}
+    assert yardstick_record.kept(tmp_path / "nowhere") == {}

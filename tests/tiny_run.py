@@ -12,10 +12,11 @@ import pytest
 
 import probe
 from faults import Disk
-from metrpo import algorithm, cli, stepwise
+from metrpo import algorithm, external
+from metrpo.commands import main
+from metrpo.commands.options import parse
 from metrpo.errors import RunDirectoryError
-from metrpo.options import parse
-from metrpo.run import claim, directory, machine
+from metrpo.run import directory, lock, machine
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.files import atomic_write
 from metrpo.training import train
@@ -54,7 +55,7 @@ def command_line(run_dir, *more):
 
 
 with probe.registered():
-    CONFIG, _ = cli._run(parse(command_line("anywhere")))
+    CONFIG, _ = main._run(parse(command_line("anywhere")))
 
 
 class Counted:
@@ -97,7 +98,7 @@ def cheap():
         patch.setattr(algorithm, "learn", learn_once)
         patch.setattr(algorithm, "init", init_once)
         patch.setattr(EpisodeLog, "append", counted_append)
-        patch.setattr(claim, "source_commit", lambda: "a commit")
+        patch.setattr(lock, "source_commit", lambda: "a commit")
         patch.setattr(machine, "prepare", lambda *_, **__: None)
         patch.setattr(directory, "draw_curve", lambda rows, path, title, *_: atomic_write(path, f"{len(rows)} rows"))
         yield
@@ -121,10 +122,10 @@ def by_steps(run_dir):
 
         return tolerant
 
-    yield unless("holds a run already", lambda: stepwise.begin(CONFIG, run_dir))
+    yield unless("holds a run already", lambda: external.begin(CONFIG, run_dir))
     for _ in range(ITERATIONS):
-        yield lambda: stepwise.collect(run_dir)
-        yield unless("expected episodes to learn from, got none", lambda: stepwise.improve(run_dir))
+        yield lambda: external.collect(run_dir)
+        yield unless("expected episodes to learn from, got none", lambda: external.improve(run_dir))
 
 
 def drive(commands, run_dir, deaths, fault="kill"):
@@ -173,7 +174,7 @@ sys.path.insert(0, sys.argv[1])
 import probe
 from metrpo import cli
 with probe.registered():
-    sys.exit(cli.main(sys.argv[2:]))
+    sys.exit(main.main(sys.argv[2:]))
 """
 
 

@@ -2,6 +2,6 @@
 
 import sys
 
-from metrpo.cli import main
+from metrpo.commands.main import main
 
 sys.exit(main())

@@ -5,8 +5,8 @@
         fit       every model of the ensemble to the dataset                    model/fit.py
         repeat:
             imagine   rollouts through the ensemble with the policy             model/imagine.py
-            improve   the policy on them, by TRPO                               policy/improve.py, policy/trpo.py
-            validate  the policy in each model                                  policy/validate.py
+            improve   the policy on them, by TRPO                               policy/improvers/
+            validate  the policy in each model                                  policy/stopping.py
         until the models no longer agree that it improves
     until the budget is spent
 
@@ -26,8 +26,9 @@ from typing import NamedTuple, Protocol, TypeVar
 import jax
 import numpy as np
 
-from metrpo import budget, phase, scales
+from metrpo import budget, policy_phase, scales
 from metrpo.config import Config
+from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import ConfigError, DivergedError, EpisodeError, MetrpoError, NotFiniteError
 from metrpo.finite import naming, require_finite
 from metrpo.model import ensemble as ensembles
@@ -35,22 +36,21 @@ from metrpo.model.calibration import Calibration, end_calibration
 from metrpo.model.diagnostics import Diagnosis, diagnose, unknown
 from metrpo.model.ensemble import Ensemble, Networks
 from metrpo.model.fit import FitInfo, fit, refit
-from metrpo.phase import PhaseInfo
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
-from metrpo.policy.improve import Baseline, init_baseline
+from metrpo.policy.improvers.table import Baseline, init_baseline
 from metrpo.policy.inputs import Inputs, folded, inputs_of, unfolded
+from metrpo.policy_phase import PhaseInfo
 from metrpo.run.clock import Clock
-from metrpo.run.progress import SILENT, Progress
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.types import Array, Episode
+from metrpo.world import batch_episodes, offline_data
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
-from metrpo.world import logged, together
 from metrpo.world.dataset import Dataset
-from metrpo.world.limits import RECORDED
 from metrpo.world.origin import relative, shifted
 from metrpo.world.registry import get_task, without_formulas
+from metrpo.world.size_limits import RECORDED
 from metrpo.world.task import Task
 
 _log = logging.getLogger("metrpo")
@@ -278,7 +278,13 @@ def learn(
         unfit = partial(scales.count, config, task, dataset, episodes)
     collected = float(np.mean([e.rewards.sum() for e in episodes])) if episodes else math.nan
     row = _row(
-        config, following, returns, collected, fitted, improved, phase.is_cut(config, task) or task.horizon > RECORDED
+        config,
+        following,
+        returns,
+        collected,
+        fitted,
+        improved,
+        policy_phase.is_cut(config, task) or task.horizon > RECORDED,
     )
     row |= {"failed_episodes": failed, "failed_evaluation": failed_evaluation(task, returns)}
     row |= {"unfit_dimensions": recorded("unfit_dimensions", iteration, unfit, math.nan)}
@@ -289,7 +295,7 @@ def learn(
 def recorded(what: str, iteration: int, record: Callable[[], T], failed: T) -> T:
     """What `record()` gives; where it fails, `failed` and a warning that says why: no record may cost what is learned.
 
-    Not so when the run is to stop (`run.interrupt.Stopped`).
+    Not so when the run is to stop (`console.interrupt.Stopped`).
     """
     try:
         return record()
@@ -322,7 +328,7 @@ def failed_evaluation(task: Task, returns: np.ndarray) -> int:
 
 
 def _diagnosis(config: Config, task: Task, state: State, ensemble: Ensemble) -> Diagnosis:
-    dataset, horizon = state.dataset, phase.imagined_horizon(config, task)
+    dataset, horizon = state.dataset, policy_phase.imagined_horizon(config, task)
     key = key_of(config.seed, state.iteration, Stage.DIAGNOSE)
     record = partial(diagnose, ensemble, state.policy, dataset.validation, dataset.train, horizon, key)
     return recorded("diagnostics", state.iteration, record, unknown(task.state_size, horizon))
@@ -388,7 +394,7 @@ def _improve(
         starts = dataset.train.states
     if config.imagine.start == "reset":
         with naming("improve", iteration):
-            starts = real.reset_states(task, max(config.validate.starts, phase.rollouts(config, task)), rng)
+            starts = real.reset_states(task, max(config.validate.starts, policy_phase.rollouts(config, task)), rng)
         starts = relative(starts, dataset.origin).astype(np.float32)
 
     def oracle(policy: Policy) -> float:
@@ -396,7 +402,7 @@ def _improve(
         # others than the record's, which would else be a selected maximum.
         return float(np.mean(recorded_returns(config, task, policy, iteration, Stage.ORACLE, dataset.origin)))
 
-    return phase.improve(
+    return policy_phase.improve(
         config,
         shifted(task, dataset.origin),
         ensemble,
@@ -434,7 +440,7 @@ def _logged(config: Config, task: Task) -> Dataset:
             raise ConfigError("real_steps: expected at least 1 without logged transitions to learn from (data), got 0")
         return nothing
     rng = rng_of(config.seed, 0, Stage.SPLIT)
-    return datasets.add(nothing, logged.load(config.data, task), config.collect, rng, task.learned)
+    return datasets.add(nothing, offline_data.load(config.data, task), config.collect, rng, task.learned)
 
 
 def task_for(config: Config) -> Task:
@@ -463,7 +469,7 @@ def evaluate(
     seed = int(rng_of(config.seed, iteration, stage).integers(2**31))
     act: real.Act = partial(gaussian.mean, _host(policy))
     act = act if origin is None else _of_real(act, origin)
-    return together.evaluate(task, act, config.evaluation_episodes, seed, EVALUATION_STEPS, RECORDED)
+    return batch_episodes.evaluate(task, act, config.evaluation_episodes, seed, EVALUATION_STEPS, RECORDED)
 
 
 def _of_real(act: real.Act, origin: np.ndarray) -> real.Act:

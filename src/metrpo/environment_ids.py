@@ -38,7 +38,7 @@ def register_ids() -> None:
         if env_id(task) not in gymnasium.registry:
             gymnasium.register(
                 env_id(task),
-                entry_point="metrpo.world.mujoco:MujocoTask",
+                entry_point="metrpo.world.tasks.rllab.environment:MujocoTask",
                 max_episode_steps=horizon,
                 disable_env_checker=True,  # it costs every step of every run what the tests check once
                 kwargs={"task": task},

@@ -14,7 +14,7 @@ from metrpo.errors import ConfigError, TaskError
 from metrpo.run.policy_file import LoadedPolicy, load_policy
 from metrpo.run.task_file import task_of_run
 from metrpo.run.video import record
-from metrpo.untrusted import brief
+from metrpo.safe_load import brief
 from metrpo.world import collect
 from metrpo.world.registry import get_task
 from metrpo.world.task import Task

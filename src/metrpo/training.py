@@ -18,29 +18,29 @@ import numpy as np
 from metrpo import budget
 from metrpo.algorithm import Log, Row
 from metrpo.config import Config
+from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import ConfigError, MetrpoError
 from metrpo.finite import require_finite
-from metrpo.memory import require_memory
 from metrpo.run import task_file
 from metrpo.run.directory import RunDirectory, Saved
-from metrpo.run.progress import SILENT, Progress
-from metrpo.run.yardsticks import are_kept, keep
+from metrpo.run.memory import require_memory
+from metrpo.run.yardstick_record import are_kept, keep
 from metrpo.seeds import Stage, rng_of
-from metrpo.world.check import check_formulas
-from metrpo.world.known import KNOWN
-from metrpo.world.limits import RECORDED
+from metrpo.world.env_returns import warning_once
+from metrpo.world.formula_check import check_formulas
 from metrpo.world.registry import get_task
-from metrpo.world.returned import warning_once
+from metrpo.world.size_limits import RECORDED
+from metrpo.world.tasks.gymnasium_formulas import KNOWN
 from metrpo.world.yardsticks import measure
 
 _log = logging.getLogger("metrpo")
 
 METHODS = {
     "model-based": "metrpo.algorithm",
-    "trpo": "metrpo.baselines.model_free",
-    "svg": "metrpo.baselines.svg",
-    "ppo": "metrpo.baselines.sb3",
-    "ddpg": "metrpo.baselines.sb3",
+    "trpo": "metrpo.baselines.real_trpo",
+    "svg": "metrpo.baselines.value_gradients",
+    "ppo": "metrpo.baselines.stable_baselines",
+    "ddpg": "metrpo.baselines.stable_baselines",
 }
 """Modules with `init` and `step`; imported when used, for some need libraries of their own."""
 
@@ -75,8 +75,9 @@ def train(config: Config, run_dir: str | Path | None = None, progress: Progress 
 
     With `run_dir`, every iteration is saved there; a run found there is resumed, exactly as if it had never stopped.
 
-    The formulas of a task of the user's own are checked first (`metrpo.world.check`). Raises `TaskError` for an unknown
-    or broken task and `RunDirectoryError` when `run_dir` cannot be used (see `RunDirectory`).
+    The formulas of a task of the user's own are checked first (`metrpo.world.formula_check`).
+
+    Raises `TaskError` for an unknown or broken task and `RunDirectoryError` when `run_dir` cannot be used.
     """
     with warning_once():
         return _train(config, run_dir, progress)
@@ -108,7 +109,7 @@ def _say_where(config: Config, run: RunDirectory, state: Saved, measured: bool, 
 
 
 def check(config: Config) -> None:
-    """Holds the formulas of a task that is not ours against its environment (`metrpo.world.check`), before a run.
+    """Holds the formulas of a task that is not ours against its environment (`metrpo.world.formula_check`).
 
     Says what evaluation will cut. Raises `TaskError` where they differ.
     """

@@ -17,8 +17,8 @@ import pytest
 
 from metrpo import read_metrics
 from metrpo.errors import RunDirectoryError
-from metrpo.experiments.standing import words
-from metrpo.experiments.sweep import Grid, values_of
+from metrpo.launch.grid import Grid, values_of
+from metrpo.launch.status import words
 
 pytestmark = [
     pytest.mark.slow,
@@ -163,7 +163,7 @@ def processes():
     for folder in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             line = (folder / "cmdline").read_text().split("\0")
-            if "metrpo.experiments.tied" in line and CART in line:
+            if "metrpo.launch.tied" in line and CART in line:
                 found[int(folder.name)] = line
     return found
 

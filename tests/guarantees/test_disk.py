@@ -12,7 +12,8 @@ import pytest
 
 import tiny_run
 from faults import Disk
-from metrpo import append_episode, cli
+from metrpo import append_episode
+from metrpo.commands import main
 from metrpo.errors import MetrpoError
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.metrics import read_metrics
@@ -109,11 +110,11 @@ def assert_told(err, run_dir, reason):
 def test_the_kernel_refuses_to_write_more(tmp_path, expected, capsys):
     run_dir, Counted.kept = tmp_path / "run", 0
     with largest_file(len(expected["checkpoints/iteration-00002.npz"]) - 1):
-        assert cli.main(command_line(run_dir)) == 2
+        assert main.main(command_line(run_dir)) == 2
     assert_told(capsys.readouterr().err, run_dir, os.strerror(errno.EFBIG))
     assert [row["iteration"] for row in read_metrics(run_dir / "metrics.csv")] == [1]
     assert len(EpisodeLog(run_dir).pending()) == 2 * EPISODES, "those of the iteration that could not be saved too"
-    assert cli.main(command_line(run_dir)) == 0
+    assert main.main(command_line(run_dir)) == 0
     assert differing(result(run_dir), expected) == []
     assert Counted.kept == ITERATIONS * EPISODES
 
@@ -136,13 +137,13 @@ def small_disk(tmp_path):
 def test_a_disk_that_is_really_full(small_disk, expected, capsys):
     disk, remount = small_disk
     run_dir, Counted.kept = disk / "run", 0
-    assert cli.main(command_line(run_dir)) == 2
+    assert main.main(command_line(run_dir)) == 2
     assert_told(capsys.readouterr().err, run_dir, os.strerror(errno.ENOSPC))
     before = result(run_dir)
-    assert cli.main(command_line(run_dir)) == 2
+    assert main.main(command_line(run_dir)) == 2
     assert result(run_dir) == before
     remount("size=10m")
-    assert cli.main(command_line(run_dir)) == 0
+    assert main.main(command_line(run_dir)) == 0
     assert differing(result(run_dir), expected) == []
     assert Counted.kept == ITERATIONS * EPISODES
 
@@ -151,17 +152,17 @@ def test_a_disk_that_is_really_read_only(small_disk, expected, capsys):
     disk, remount = small_disk
     run_dir = disk / "run"
     remount("size=10m")
-    assert cli.main(command_line(run_dir, "--iterations", "2")) == 0
+    assert main.main(command_line(run_dir, "--iterations", "2")) == 0
     remount("ro")
     before = result(run_dir)
     for command in (command_line(run_dir), ["collect", str(run_dir)], ["improve", str(run_dir)]):
-        assert cli.main(command) == 2
+        assert main.main(command) == 2
         err = capsys.readouterr().err
         assert f"metrpo: cannot write in {run_dir}: Read-only file system; choose a writable directory" in err
     with pytest.raises(MetrpoError, match=r"cannot write .*Read-only file system"):
         append_episode(run_dir, [[0, 0], [0, 0]], [[0, 0]], [0.0], terminated=False)
     assert result(run_dir) == before
     remount("rw")
-    assert cli.main(command_line(run_dir)) == 0
+    assert main.main(command_line(run_dir)) == 0
     # That iteration's checkpoint names the budget of then.
     assert differing(result(run_dir), expected) == ["checkpoints/iteration-00002.npz"]

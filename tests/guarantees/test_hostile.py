@@ -30,11 +30,11 @@ import pytest
 import probe
 from helpers import random_episode, random_policy
 from metrpo import config as configs
-from metrpo import training, untrusted
+from metrpo import safe_load, training
 from metrpo.config import Config
 from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError, TaskError
 from metrpo.presets import override
-from metrpo.run import claim, directory
+from metrpo.run import directory, lock
 from metrpo.run.checkpoint import load_state
 from metrpo.run.directory import RunDirectory, stored_config
 from metrpo.run.episodes import EpisodeLog
@@ -42,7 +42,7 @@ from metrpo.run.export import export
 from metrpo.run.files import read_arrays, write_arrays
 from metrpo.run.metrics import read_metrics, to_csv
 from metrpo.run.policy_file import LoadedPolicy, load_policy, save_policy
-from metrpo.world import logged
+from metrpo.world import offline_data
 
 CONFIG = override(
     Config("Probe"),
@@ -116,9 +116,9 @@ LOADERS = {
     "checkpoint": Loader("iteration-00000.npz", _load_checkpoint, _sound_state, signed=True),
     "policy": Loader("policy.npz", load_policy, _sound_policy, signed=True),
     "episode": Loader("00000000.npz", _load_episode, _sound_episodes, signed=True),
-    "logged data": Loader("log.npz", lambda path: logged.load(path, probe.PROBE), _sound_episodes),
+    "logged data": Loader("log.npz", lambda path: offline_data.load(path, probe.PROBE), _sound_episodes),
     "config": Loader("config.json", lambda path: stored_config(path.parent), _sound_config),
-    "run": Loader("run.json", claim._check_or_describe, lambda none: None),
+    "run": Loader("run.json", lock._check_or_describe, lambda none: None),
     "metrics": Loader("metrics.csv", read_metrics, _sound_rows),
 }
 ARCHIVES = ("checkpoint", "policy", "episode", "logged data")
@@ -321,7 +321,7 @@ def test_onnx_and_pickles_are_never_read():
     forbidden = re.compile(
         r"\bonnx\.load|\bpickle\.\w|import pickle|np\.load\(|\beval\(|\bexec\(|marshal|shelve|joblib"
     )
-    source = Path(untrusted.__file__).parent
+    source = Path(safe_load.__file__).parent
     found = [
         f"{path.relative_to(source)}: {line.strip()}"
         for path in sorted(source.rglob("*.py"))
@@ -418,7 +418,7 @@ def _many(kind):
 
 def _expanding(members, first, kind):
     """A thousand zeros for every byte, in a stream of 2 GB; the header agrees with it."""
-    size = 2 * untrusted.LARGEST_EXPANSION
+    size = 2 * safe_load.LARGEST_EXPANSION
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for name, content in members.items():
@@ -490,7 +490,7 @@ def test_a_log_may_be_compressed_and_ours_are_not(sound, there):
         path = there(kind)
         path.write_bytes(archive_of(members_of(sound[kind]), kind, compress=True))
         if kind == "logged data":
-            assert len(logged.load(path, probe.PROBE)) == 1
+            assert len(offline_data.load(path, probe.PROBE)) == 1
         else:
             refused(kind, path, "compressed in a way that is not read")
 
@@ -501,8 +501,8 @@ def test_a_compressed_log_expands_to_a_stated_limit(sound, there, monkeypatch):
     arrays |= {"rewards": np.zeros(70_000), "terminated": np.zeros(70_000)}
     np.savez_compressed(path, **arrays)
     assert path.stat().st_size < 50_000 < sum(a.nbytes for a in arrays.values())
-    assert len(logged.load(path, probe.PROBE)) == 1
-    monkeypatch.setattr(untrusted, "LARGEST_EXPANSION", 1 << 20)
+    assert len(offline_data.load(path, probe.PROBE)) == 1
+    monkeypatch.setattr(safe_load, "LARGEST_EXPANSION", 1 << 20)
     with bounded(8 << 20):
         refused("logged data", path, "expand to .* save it without compression")
 
@@ -801,7 +801,7 @@ def test_a_log_holds_what_float32_holds(changes, message, sound, there):
     with np.load(io.BytesIO(sound["logged data"])) as archive:
         np.savez(path, **{**archive, **changes})
     with pytest.raises(TaskError, match=message):
-        logged.load(path, probe.PROBE)
+        offline_data.load(path, probe.PROBE)
 
 
 # ---------------------------------------------------------------- the fuzzer

@@ -16,7 +16,7 @@ import pytest
 
 import probe
 import tiny_run
-from metrpo import stepwise
+from metrpo import external
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.metrics import read_metrics
 from tiny_run import CONFIG, EPISODES, ITERATIONS, Counted, by_steps, by_train, differing, drive, process_line, result
@@ -92,14 +92,14 @@ def test_a_log_added_half_way_is_added_once(tmp_path):
     np.savez(log, **dict(zip(("states", "next_states", "actions", "rewards"), whole, strict=True)), **ends)
 
     def commands(run_dir):
-        yield lambda: stepwise.collect(run_dir, data=log)
+        yield lambda: external.collect(run_dir, data=log)
 
-    stepwise.begin(CONFIG, run_dir)
+    external.begin(CONFIG, run_dir)
     (operations,) = drive(commands, run_dir, [])
     assert len(operations) > 40
     for n in range(1, len(operations) + 1, 5):
         run_dir = tmp_path / str(n) / "new" / "run"
-        stepwise.begin(CONFIG, run_dir)
+        external.begin(CONFIG, run_dir)
         drive(commands, run_dir, [n])
         waiting = EpisodeLog(run_dir).pending()
         assert [e.rewards.sum() for e in waiting] == [pytest.approx(r.sum(), rel=1e-5) for _, _, r in played]

@@ -17,7 +17,7 @@ import probe
 from metrpo import training
 from metrpo.config import Config
 from metrpo.presets import override
-from metrpo.run.progress import Progress
+from metrpo.console.progress import Progress
 
 class Memory(Progress):
     resident = []

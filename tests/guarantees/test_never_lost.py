@@ -15,19 +15,21 @@ import pytest
 
 import probe
 import tiny_run
-from metrpo import algorithm, cli, stepwise, training
+from metrpo import algorithm, external, training
+from metrpo.checks.health import examine
+from metrpo.commands import main
+from metrpo.console import interrupt
+from metrpo.console.interrupt import Interruptible, Stopped
+from metrpo.console.progress import Progress
 from metrpo.errors import TaskError
 from metrpo.model import calibration, diagnostics
 from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Ensemble
 from metrpo.model.fit import FitInfo
-from metrpo.phase import PhaseInfo
-from metrpo.run import interrupt, machine
+from metrpo.policy_phase import PhaseInfo
+from metrpo.run import machine
 from metrpo.run.directory import RunDirectory
-from metrpo.run.interrupt import Interruptible, Stopped
 from metrpo.run.metrics import read_metrics
-from metrpo.run.progress import Progress
-from metrpo.seeing.health import examine
 from metrpo.training import train
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
@@ -203,7 +205,7 @@ def killed_at(steps):
 def test_where_every_episode_fails_it_is_said_and_nothing_goes_on(tmp_path, taught, monkeypatch, capsys):
     monkeypatch.setattr(Sick, "sickness", staticmethod(lambda start, step: step == 2))
     run_dir = tmp_path / "run"
-    assert cli.main(tiny_run.command_line(run_dir)) == 2
+    assert main.main(tiny_run.command_line(run_dir)) == 2
     err = capsys.readouterr().err
     assert "10 episodes before it failed too: repair the environment" in err
     assert "The same command goes on" not in err
@@ -222,9 +224,9 @@ def test_an_exception_is_tried_once_more_and_then_left_out(tmp_path, taught, mon
     hot.left = 2
     monkeypatch.setattr(Sick, "sickness", staticmethod(hot))
     command = tiny_run.command_line(tmp_path / "run")
-    assert cli.main(command) == 2
+    assert main.main(command) == 2
     assert "The same command goes on." in capsys.readouterr().err
-    assert cli.main(command) == 0
+    assert main.main(command) == 0
     rows = read_metrics(tmp_path / "run" / "metrics.csv")
     assert [row["failed_episodes"] for row in rows] == [1, 0, 0]
 
@@ -262,9 +264,9 @@ def test_what_cannot_go_on_does_not_say_so(tmp_path, taught, monkeypatch, capsys
     elsewhere = Task("Elsewhere", None, 2, 2, probe.HORIZON, probe.reward)
     monkeypatch.setitem(registry._TASKS, "Elsewhere", elsewhere)
     run_dir = tmp_path / "run"
-    stepwise.begin(dataclasses.replace(CONFIG, task="Elsewhere"), run_dir)
-    assert cli.main(["collect", str(run_dir)]) == 2
-    assert cli.main(["collect", str(run_dir), "--data", str(tmp_path / "none.npz")]) == 2
+    external.begin(dataclasses.replace(CONFIG, task="Elsewhere"), run_dir)
+    assert main.main(["collect", str(run_dir)]) == 2
+    assert main.main(["collect", str(run_dir), "--data", str(tmp_path / "none.npz")]) == 2
     err = capsys.readouterr().err
     assert "expected an environment, got none" in err
     assert "expected an .npz of numbers" in err
@@ -318,7 +320,7 @@ def test_a_request_to_stop_does_not_wait_for_a_long_episode(tmp_path, monkeypatc
 
     monkeypatch.setattr(probe.ProbeEnv, "step", slow)
     monkeypatch.setattr(interrupt, "PATIENCE", 0.3, raising=False)
-    assert cli.main(tiny_run.command_line(tmp_path / "run")) == 143
+    assert main.main(tiny_run.command_line(tmp_path / "run")) == 143
     assert time.monotonic() - began[0] < 1.5
     assert not list((tmp_path / "run").glob("episodes/*.npz"))
     assert "The same command goes on." in capfd.readouterr().err

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import probe
-from metrpo import stepwise, training
+from metrpo import external, training
 from metrpo.errors import RunDirectoryError
 from metrpo.presets import override, preset
 from metrpo.run import directory as directories
@@ -124,12 +124,12 @@ def resume(run_dir):
     ("name", "use"),
     [
         ("run.json", resume),
-        ("run.json", stepwise.improve),
+        ("run.json", external.improve),
         ("checkpoints/iteration-00002.npz", resume),
-        ("checkpoints/iteration-00002.npz", stepwise.improve),
+        ("checkpoints/iteration-00002.npz", external.improve),
         ("policy.npz", load_policy),
         ("episodes/00000000.npz", resume),
-        ("episodes/00000000.npz", stepwise.improve),
+        ("episodes/00000000.npz", external.improve),
     ],
 )
 def test_a_file_of_format_2_is_refused_by_name_and_left_alone(run_dir, name, use):

@@ -14,23 +14,23 @@ import pytest
 
 import probe
 from helpers import random_policy
-from metrpo import algorithm, finite, phase, training
-from metrpo.baselines import model_free
+from metrpo import algorithm, finite, policy_phase, training
+from metrpo.baselines import real_trpo
 from metrpo.config import Config
+from metrpo.console.progress import SILENT
 from metrpo.errors import DivergedError, TaskError
 from metrpo.model import fit as fitting
 from metrpo.model.imagine import ImagineInfo, imagine, returns_per_model
-from metrpo.policy import advantage
-from metrpo.policy.improve import IMPROVERS, init_baseline, init_memory
-from metrpo.policy.validate import RULES, Evidence
+from metrpo.policy.improvers.table import IMPROVERS, init_baseline, init_memory
+from metrpo.policy.stopping import RULES, Evidence
+from metrpo.policy.value import linear
 from metrpo.presets import override
 from metrpo.run import directory
 from metrpo.run.metrics import completed, read_metrics
-from metrpo.run.progress import SILENT
 from metrpo.training import train
 from metrpo.types import Trajectories
 from metrpo.world import collect as real
-from metrpo.world.guard import Guarded
+from metrpo.world.env_wrapper import Guarded
 
 POISON = [math.nan, math.inf, -math.inf]
 TINY = override(
@@ -286,7 +286,7 @@ def test_the_other_methods_are_held_to_it_as_they_end_an_iteration(monkeypatch, 
     def step(config, state, progress):
         return state._replace(iteration=1, policy=poisoned(state.policy, value)), {}
 
-    monkeypatch.setattr(model_free, "step", step)
+    monkeypatch.setattr(real_trpo, "step", step)
     with pytest.raises(DivergedError, match=r"^learn, iteration 1: state\.policy\.layers\[0\]\[0\]: .* learning rates"):
         train(config, tmp_path)
     assert iterations_on_disk(tmp_path) == 0
@@ -474,7 +474,7 @@ def test_the_largest_finite_batch_is_still_one(clean):
     rewards = np.where(rng.uniform(size=(200, 100)) < 0.5, -0.99e12, 0.99e12).astype(np.float32)
     states = rng.uniform(-1e6, 1e6, (200, 100, 2)).astype(np.float32)
     rollouts = Trajectories(states, states, rewards, np.ones_like(rewards), states[0], np.ones(100, np.float32))
-    got = jax.jit(lambda t: advantage.advantages_and_baseline(t, jnp.zeros(8), 0.99, 0.95, 1e-5))(rollouts)
+    got = jax.jit(lambda t: linear.advantages_and_value(t, jnp.zeros(8), 0.99, 0.95, 1e-5))(rollouts)
     assert sound(got)
     assert np.std(got[0]) == pytest.approx(1, rel=1e-3)
 
@@ -584,7 +584,9 @@ def test_rollouts_that_all_diverged_are_no_improvement_over_a_loss():
     config = TINY.validate
     rule = RULES["trpo_mean"]
     lost, some = (ImagineInfo(np.array([-3.0, 0.0]), np.array([0.0, d]), np.array([9.0, 0.0])) for d in (1.0, 0.5))
-    evidence = [rule.evidence(Evidence(np.zeros(3), phase._last_return(info), lambda: 0.0)) for info in (lost, some)]
+    evidence = [
+        rule.evidence(Evidence(np.zeros(3), policy_phase._last_return(info), lambda: 0.0)) for info in (lost, some)
+    ]
     assert not rule.decide(evidence[0], np.array([-100.0]), config)
     assert rule.decide(evidence[1], np.array([-100.0]), config)
 

@@ -13,8 +13,8 @@ import pytest
 
 import tiny_run
 from faults import Disk
-from metrpo.experiments.sent import Copy
-from metrpo.experiments.store import Store
+from metrpo.launch.ray.store import Store
+from metrpo.launch.ray.sync import Copy
 from metrpo.run.metrics import read_metrics
 from metrpo.training import train
 from tiny_run import CONFIG, ITERATIONS, differing, result

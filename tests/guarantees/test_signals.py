@@ -13,13 +13,14 @@ import time
 import pytest
 
 import tiny_run
-from metrpo import cli, stepwise
-from metrpo.experiments import local
+from metrpo import external
+from metrpo.commands import main
+from metrpo.console.interrupt import Interruptible, Stopped
+from metrpo.console.progress import PlainProgress, Progress
+from metrpo.launch import local
 from metrpo.run import files
 from metrpo.run.episodes import EpisodeLog
-from metrpo.run.interrupt import Interruptible, Stopped
 from metrpo.run.metrics import read_metrics
-from metrpo.run.progress import PlainProgress, Progress
 from tiny_run import CONFIG, EPISODES, Counted, command_line, differing, result, train
 
 SIGNALS = [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
@@ -77,7 +78,7 @@ def finished(run_dir):
 
 def assert_it_goes_on(run_dir, expected):
     """The very command ends the run as if it had never been stopped; no episode that was on disk is played again."""
-    assert cli.main(command_line(run_dir)) == 0
+    assert main.main(command_line(run_dir)) == 0
     assert differing(result(run_dir), expected) == []
     assert Counted.kept == tiny_run.ITERATIONS * EPISODES
 
@@ -88,7 +89,7 @@ def test_the_first_ends_the_run_after_its_step(number, code, stage, saved, tmp_p
     Counted.kept, run_dir = 0, tmp_path / "a run"
     with monkeypatch.context() as patch:
         send(patch, number, 1, 2, stage)
-        assert cli.main(command_line(run_dir)) == code
+        assert main.main(command_line(run_dir)) == code
     assert finished(run_dir) == list(range(1, saved + 1))
     assert Counted.kept == EPISODES + {None: 0, "collect": 1}.get(stage, EPISODES), "the episode under way is kept"
     err = capfd.readouterr().err
@@ -103,7 +104,7 @@ def test_the_second_ends_it_at_once_and_loses_the_step_only(stage, tmp_path, exp
     Counted.kept = 0
     with monkeypatch.context() as patch:
         send(patch, signal.SIGINT, 2, 2, stage)
-        assert cli.main(command_line(tmp_path / "run")) == 130
+        assert main.main(command_line(tmp_path / "run")) == 130
     assert finished(tmp_path / "run") == [1]
     assert "The same command goes on." in capfd.readouterr().err
     assert_it_goes_on(tmp_path / "run", expected)
@@ -114,7 +115,7 @@ def test_in_the_last_evaluation_nothing_goes_on(tmp_path, expected, monkeypatch,
     run_dir = tmp_path / "run"
     with monkeypatch.context() as patch:
         send(patch, signal.SIGTERM, 1, tiny_run.ITERATIONS, "evaluate")
-        assert cli.main(command_line(run_dir)) == 143
+        assert main.main(command_line(run_dir)) == 143
     err = capfd.readouterr().err
     assert "goes on" not in err
     command = shlex.join(["metrpo", *command_line(run_dir)])
@@ -123,7 +124,7 @@ def test_in_the_last_evaluation_nothing_goes_on(tmp_path, expected, monkeypatch,
     assert differing(result(run_dir), expected) == []
     with monkeypatch.context() as patch:
         send(patch, signal.SIGTERM, 1, tiny_run.ITERATIONS + 1, "collect")
-        assert cli.main(command_line(run_dir, "--iterations", str(tiny_run.ITERATIONS + 1))) == 143
+        assert main.main(command_line(run_dir, "--iterations", str(tiny_run.ITERATIONS + 1))) == 143
     assert "The same command goes on." in capfd.readouterr().err, "a larger budget is not spent"
 
 
@@ -142,7 +143,7 @@ def test_while_a_checkpoint_is_written(times, tmp_path, expected, monkeypatch):
     Counted.kept = 0
     with monkeypatch.context() as patch:
         patch.setattr(files.os, "fsync", interrupted)
-        assert cli.main(command_line(tmp_path / "run")) == 143
+        assert main.main(command_line(tmp_path / "run")) == 143
     assert finished(tmp_path / "run") == ([1, 2] if times == 1 else [1])
     assert_it_goes_on(tmp_path / "run", expected)
 
@@ -150,23 +151,23 @@ def test_while_a_checkpoint_is_written(times, tmp_path, expected, monkeypatch):
 def test_what_a_shell_lets_run_in_its_background_ignores_ctrl_c(tmp_path, monkeypatch):
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     send(monkeypatch, signal.SIGINT, 3, 1, "fit")
-    assert cli.main(command_line(tmp_path / "run")) == 0
+    assert main.main(command_line(tmp_path / "run")) == 0
     assert signal.signal(signal.SIGINT, signal.default_int_handler) is signal.SIG_IGN
 
 
 @pytest.mark.parametrize(("number", "code"), SIGNALS)
 def test_the_single_steps_too(number, code, tmp_path, expected, monkeypatch, capfd):
     Counted.kept, run_dir = 0, tmp_path / "run"
-    stepwise.begin(CONFIG, run_dir)
+    external.begin(CONFIG, run_dir)
     with monkeypatch.context() as patch:
         send(patch, number, 1, 1, "collect")
-        assert cli.main(["collect", str(run_dir)]) == code
+        assert main.main(["collect", str(run_dir)]) == code
     assert len(EpisodeLog(run_dir).pending()) == 1
     assert f"metrpo collect {run_dir}" in capfd.readouterr().err
-    assert cli.main(["collect", str(run_dir)]) == 0
+    assert main.main(["collect", str(run_dir)]) == 0
     with monkeypatch.context() as patch:
         send(patch, number, 1, 1, "improve")
-        assert cli.main(["improve", str(run_dir)]) == code
+        assert main.main(["improve", str(run_dir)]) == code
     assert "nothing is left to do.\n" in (err := capfd.readouterr().err)
     assert "metrpo improve" not in err, "given again it would find no episodes"
     assert finished(run_dir) == [1]

@@ -14,10 +14,11 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event
 
 import tiny_run
-from metrpo import cli
-from metrpo.run import directory, progress
+from metrpo.commands import main
+from metrpo.console import progress
+from metrpo.console.progress import Guarded, Progress
+from metrpo.run import directory
 from metrpo.run.metrics import Events, read_metrics
-from metrpo.run.progress import Guarded, Progress
 from tiny_run import CONFIG, ITERATIONS, command_line, differing, process_line, result, train
 
 
@@ -126,7 +127,7 @@ def test_a_full_disk_does_not_stop_tensorboards_writer_for_ever(tmp_path):
 def test_a_video_that_breaks_costs_only_itself(tmp_path, expected, monkeypatch, capsys):
     monkeypatch.setattr("metrpo.evaluation.render", raises)
     line = [word for word in command_line(tmp_path / "run") if word != "--no-video"]
-    assert cli.main(line) == 0
+    assert main.main(line) == 0
     assert "video    none (RuntimeError: no fonts)" in capsys.readouterr().out
     assert differing(result(tmp_path / "run"), expected) == []
 
@@ -185,7 +186,7 @@ def test_processes_whose_output_goes_nowhere(tmp_path):
 
 
 def test_an_error_is_an_error_even_if_nobody_reads_it(tmp_path):
-    program = "import sys; from metrpo.cli import main; sys.exit(main(['evaluate', sys.argv[1]]))"
+    program = "import sys; from metrpo.commands.main import main; sys.exit(main(['evaluate', sys.argv[1]]))"
     for how in ("2>&-", "2> /dev/full"):
         command = f"'{sys.executable}' -c \"{program}\" '{tmp_path}' {how}"
         assert subprocess.run(["bash", "-c", command]).returncode == 2

@@ -12,8 +12,8 @@ import numpy as np
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.types import Episode
+from metrpo.world import batch_episodes
 from metrpo.world import collect as real
-from metrpo.world import together
 from metrpo.world.collect import seed_of
 from metrpo.world.task import Task
 
@@ -37,10 +37,10 @@ def collect(
 ) -> Drawn:
     """Whole episodes of `at_least` steps together, acting by samples of `policy` (see `world.collect.collect`).
 
-    The paper's tasks are played many episodes at a time (`world.together`), each with noise of its own.
+    The paper's tasks are played many episodes at a time (`world.batch_episodes`), each with noise of its own.
     No step is played beyond `at_most` of all together.
     """
-    if together.applies(task):
+    if batch_episodes.applies(task):
         return _together(task, policy, at_least, rng, on_episode, longest, at_most)
     host = jax.tree.map(np.asarray, policy)
     std, drawn, actions = np.exp(host.log_std), list[list[np.ndarray]](), list[np.ndarray]()
@@ -88,5 +88,5 @@ def _together(
             drawn[number][step] = actions[i]
         return actions
 
-    episodes = together.play(task, act, seeds(), at_least, longest, on_steps, at_most=at_most)
+    episodes = batch_episodes.play(task, act, seeds(), at_least, longest, on_steps, at_most=at_most)
     return Drawn(episodes, [actions[: len(e.rewards)] for actions, e in zip(drawn, episodes, strict=True)])

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from metrpo.model.ensemble import Ensemble, predict
-from metrpo.model.imagine import EXPLODED, Keys, disagreement, step_rand
+from metrpo.model.imagine import EXPLODED, disagreement
+from metrpo.model.sampling import Keys, step_rand
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.types import Array, Transitions

@@ -85,7 +85,7 @@ def normaliser_of(
 
 
 class Predictor(Protocol):
-    """What `predict` needs: an `Ensemble`, or one device's share of it (`metrpo.model.shared`)."""
+    """What `predict` needs: an `Ensemble`, or one device's share of it (`metrpo.model.model_parallel`)."""
 
     @property
     def members(self) -> int:

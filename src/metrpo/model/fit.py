@@ -15,7 +15,7 @@ import numpy as np
 from metrpo import devices
 from metrpo.config import FitConfig
 from metrpo.model.ensemble import Ensemble, Networks
-from metrpo.model.passes import Progress, optimizer_of, train_and_validate, validation_loss
+from metrpo.model.epochs import Progress, optimizer_of, train_and_validate, validation_loss
 from metrpo.types import Array, Normaliser, Transitions
 
 

@@ -1,20 +1,17 @@
-"""Rollouts through the ensemble: the simulator in which the policy learns (paper, section 5).
-
-Sampling functions choose the next state: (ensemble, states [N, S], actions [N, A], keys) -> [N, D], the next state
-first and then what else is learned. They stand in one table, `SAMPLINGS` (paper, appendix "Ensemble sampling methods").
-"""
+"""Rollouts through the ensemble: the simulator in which the policy learns (paper, section 5)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from metrpo.devices import across, share_of
-from metrpo.model.ensemble import Ensemble, Predictor, first_member, predict, predict_delta
-from metrpo.model.shared import can_share, shared
+from metrpo.model.ensemble import Ensemble, Predictor, predict, predict_delta
+from metrpo.model.model_parallel import can_share, shared
+from metrpo.model.sampling import SAMPLINGS, Keys, for_all
 from metrpo.types import Act, Array, Trajectories
 
 Reward = Callable[[Array, Array, Array], Array]
@@ -40,94 +37,6 @@ class ImagineInfo(NamedTuple):
     """Steps that count."""
 
 
-def model_choice(key: Array, count: int, members: int) -> tuple[Array, Array]:
-    """A model for each of `count` states, in equal groups: (slots [K, G], model of every state [count]).
-
-    Row k of `slots` holds the states of model k, padded with `count` (an index out of range). States are dealt to the
-    models from a shuffled deck, so each state's model is uniform and independent from step to step, every rollout has
-    the law of independent draws, and K models cost the products of one.
-    """
-    group = -(-count // members)
-    # The deck is shuffled with its blanks, else the last model would be drawn less often than the others.
-    deck = jax.random.permutation(key, group * members)
-    slots = jnp.where(deck < count, deck, count).reshape(members, group)
-    numbers = jnp.arange(members, dtype=jnp.int32)[:, None]
-    models = jnp.zeros(count, jnp.int32).at[slots].set(numbers, mode="drop")
-    return slots, models
-
-
-class Keys(NamedTuple):
-    """Randomness of one imagined step."""
-
-    step: Array
-    """Another one in every step."""
-    episode: Array
-    """The same in all steps of a batch of episodes."""
-
-
-def step_rand(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
-    """One model drawn at random for each state and step (paper, section 5)."""
-    return _of_drawn_models(ensemble, states, actions, keys.step)
-
-
-def eps_rand(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
-    """One model drawn at random for each episode."""
-    return _of_drawn_models(ensemble, states, actions, keys.episode)
-
-
-def _of_drawn_models(ensemble: Predictor, states: Array, actions: Array, key: Array) -> Array:
-    slots, _ = model_choice(key, states.shape[0], ensemble.members)
-    # The blanks repeat the last state; their predictions are dropped.
-    grouped = predict(
-        ensemble, jnp.take(states, slots, axis=0, mode="clip"), jnp.take(actions, slots, axis=0, mode="clip")
-    )
-    return jnp.zeros((states.shape[0], grouped.shape[-1])).at[slots].set(grouped, mode="drop")
-
-
-def one_model(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
-    """The first model, always."""
-    return predict(first_member(ensemble), states[None], actions[None])[0]
-
-
-def model_mean(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
-    """The mean of all models' predictions."""
-    return jnp.mean(_of_all_models(ensemble, states, actions), axis=0)
-
-
-def model_med(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
-    """The median of all models' predictions, dimension by dimension."""
-    return jnp.median(_of_all_models(ensemble, states, actions), axis=0)
-
-
-def model_mean_std(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
-    """Drawn from N(mean, std^2) of all models' predictions, dimension by dimension."""
-    predictions = _of_all_models(ensemble, states, actions)
-    noise = jax.random.normal(keys.step, predictions.shape[1:])
-    # Not jnp.std: where all models agree, its gradient is NaN.
-    variance = jnp.mean(jnp.square(predictions - jnp.mean(predictions, axis=0)), axis=0)
-    std = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
-    return jnp.mean(predictions, axis=0) + std * noise
-
-
-def _of_all_models(ensemble: Ensemble, states: Array, actions: Array) -> Array:
-    return predict(ensemble, *(_for_all(ensemble, x) for x in (states, actions)))
-
-
-def _for_all(ensemble: Predictor, x: Array) -> Array:
-    """[N, ...] -> [K, N, ...], the same for every model."""
-    return jnp.broadcast_to(x, (ensemble.members, *x.shape))
-
-
-SAMPLINGS: dict[str, Callable[[Any, Array, Array, Keys], Array]] = {
-    "step_rand": step_rand,
-    "model_mean_std": model_mean_std,
-    "model_mean": model_mean,
-    "model_med": model_med,
-    "eps_rand": eps_rand,
-    "one_model": one_model,
-}
-
-
 def outcome(
     reward: Reward | None, terminated: Terminated | None, states: Array, actions: Array, predicted: Array
 ) -> tuple[Array, Array, Array | None]:
@@ -146,7 +55,7 @@ def outcome(
 def disagreement(ensemble: Predictor, states: Array, actions: Array) -> Array:
     """How far the models' predictions spread, [N, S], [N, A] -> [N]: their standard deviation, in units of each
     dimension's std in the data, mean over the dimensions (the paper's section "Discussion": a reason to explore)."""
-    deltas = predict_delta(ensemble, *(_for_all(ensemble, x) for x in (states, actions)))
+    deltas = predict_delta(ensemble, *(for_all(ensemble, x) for x in (states, actions)))
     deltas = deltas / ensemble.normaliser.delta_std
     return jnp.mean(jnp.std(deltas, axis=0), axis=-1)
 
@@ -253,7 +162,7 @@ def returns_per_model(
             alive = alive * (1.0 - ended)
         return (following, alive, total), None
 
-    states = _for_all(ensemble, starts)
+    states = for_all(ensemble, starts)
     zeros = jnp.zeros(states.shape[:2])
     weights = jnp.float32(discount) ** jnp.arange(horizon)
     (states, alive, total), _ = jax.lax.scan(step, (states, zeros + 1.0, zeros), weights)

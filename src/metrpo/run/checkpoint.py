@@ -12,7 +12,7 @@ import numpy as np
 
 from metrpo.errors import RunDirectoryError
 from metrpo.run.files import metrpo_version, read_arrays, write_arrays
-from metrpo.untrusted import brief
+from metrpo.safe_load import brief
 
 Tree = TypeVar("Tree")
 _LATER = frozenset({".dataset.origin"})

@@ -30,11 +30,12 @@ import numpy as np
 from metrpo import config as configs
 from metrpo.config import Config
 from metrpo.errors import ConfigError, RunDirectoryError, TaskError
-from metrpo.run import yardsticks
+from metrpo.run import yardstick_record
 from metrpo.run.checkpoint import load_state, save_state
-from metrpo.run.claim import claim, require_same
+from metrpo.run.curve import draw_curve
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.files import DamagedFile, atomic_write, inside, writing
+from metrpo.run.lock import claim, require_same
 from metrpo.run.metrics import (
     Events,
     Row,
@@ -48,8 +49,7 @@ from metrpo.run.metrics import (
     without_clocks,
 )
 from metrpo.run.policy_file import Interface, Weights, has_policy, save_policy
-from metrpo.run.report import draw_curve
-from metrpo.untrusted import text_of
+from metrpo.safe_load import text_of
 from metrpo.world.registry import get_task
 
 _log = logging.getLogger("metrpo")
@@ -258,7 +258,7 @@ class RunDirectory:
 
     def _draw_curve(self) -> None:
         title = f"{self.config.task}, {self.config.system}, {self.config.preset}, seed {self.config.seed}"
-        draw_curve(self.rows, self.path / "curve.png", title, yardsticks.kept(self.path))
+        draw_curve(self.rows, self.path / "curve.png", title, yardstick_record.kept(self.path))
 
     def _write_details(self) -> None:
         if all(rows := [details(row) for row in self.rows]):

@@ -25,8 +25,8 @@ import numpy as np
 from metrpo.errors import RunDirectoryError, TaskError
 from metrpo.run.files import atomic_write, length_of, read_arrays, read_meta, sync_directory, write_arrays, writing
 from metrpo.run.policy_file import load_policy
+from metrpo.safe_load import brief, json_of, text_of
 from metrpo.types import Episode
-from metrpo.untrusted import brief, json_of, text_of
 
 _log = logging.getLogger("metrpo")
 _KINDS: dict[str, tuple[Any, ...]] = {"terminated": (bool,), "states": (np.float64, np.float32)}

@@ -22,7 +22,7 @@ import numpy as np
 from metrpo.errors import MetrpoError, RunDirectoryError
 from metrpo.run.files import atomic_write, metrpo_version
 from metrpo.run.policy_file import FILE, LoadedPolicy, load_policy, with_interface
-from metrpo.untrusted import opened
+from metrpo.safe_load import opened
 
 _Writer = Callable[[LoadedPolicy, Path], bytes | str]
 _IMPORTED = ("base64", "hashlib", "numpy")
@@ -68,8 +68,8 @@ def _completed(policy: LoadedPolicy) -> LoadedPolicy:
     """A policy from before its file said what its environment shows and takes, with that of a task of ours."""
     if policy.info.observation is not None:
         return policy
-    from metrpo.world.known import KNOWN
     from metrpo.world.registry import get_task, tasks
+    from metrpo.world.tasks.gymnasium_formulas import KNOWN
 
     name = policy.info.task
     if name not in KNOWN and name not in tasks():  # to ask a file of somebody's would run it

@@ -23,7 +23,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 
 from metrpo.errors import RunDirectoryError
-from metrpo.untrusted import LARGEST_FILE, LARGEST_TEXT, arrays_of, brief, json_of, opened
+from metrpo.safe_load import LARGEST_FILE, LARGEST_TEXT, arrays_of, brief, json_of, opened
 
 FORMAT = 1
 """Raised whenever a file of a run directory changes its meaning; other formats are refused by name."""
@@ -105,7 +105,7 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the `meta` that `write_arrays` wrote.
 
     Raises `DamagedFile` when the file is not byte for byte as written, `RunDirectoryError` when it cannot be read,
-    is of another format, or was made to look like one of ours (see `metrpo.untrusted`).
+    is of another format, or was made to look like one of ours (see `metrpo.safe_load`).
     """
     with opened(path, RunDirectoryError) as file:
         found, expected = _digests(file)

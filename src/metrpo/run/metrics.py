@@ -16,7 +16,7 @@ from typing import Any
 
 from metrpo.counting import counted
 from metrpo.errors import RunDirectoryError
-from metrpo.untrusted import text_of
+from metrpo.safe_load import text_of
 
 Row = dict[str, int | float | None]
 """One iteration by column, in column order; None is an empty cell."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from metrpo.errors import RunDirectoryError
 from metrpo.run.files import FORMAT, atomic_write, inside, metrpo_version, read_arrays, write_arrays
-from metrpo.untrusted import brief
+from metrpo.safe_load import brief
 
 FILE = "policy.npz"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from metrpo.errors import ConfigError, MissingTaskError, RunDirectoryError
 from metrpo.run.files import atomic_write
-from metrpo.untrusted import json_of, text_of
+from metrpo.safe_load import json_of, text_of
 from metrpo.world import resolve
 from metrpo.world.registry import get_task
 from metrpo.world.task import Task

@@ -16,9 +16,9 @@ import gymnasium
 import numpy as np
 
 from metrpo.errors import MetrpoError
-from metrpo.gl import INSTALL_GL
 from metrpo.run.files import temporary_path
-from metrpo.world import returned
+from metrpo.world import env_returns
+from metrpo.world.opengl import INSTALL_GL
 
 INSTALL_EXTRA = "pip install 'metrpo[video]'"
 _GL = ("mujoco", "OpenGL", "glfw", "pyglet")
@@ -105,7 +105,7 @@ def _episode(
         env = make_env(render_mode="rgb_array")
     except Exception as error:  # whatever somebody's constructor raises
         raise _blame(error, 'the environment cannot be made with render_mode="rgb_array"') from error
-    with returned.closing(env, "the environment"):
+    with env_returns.closing(env, "the environment"):
         observation, _ = env.reset(seed=seed)
         frames, over = [_frame(env)], False
         while not over and len(frames) <= FRAMES:

@@ -1,7 +1,7 @@
 """The real side: tasks with known reward and unknown dynamics. Importing it registers the MuJoCo tasks."""
 
-from metrpo.gl import load_mujoco
+from metrpo.world.opengl import load_mujoco
 
 load_mujoco()  # before anything below imports it: without the OpenGL that MUJOCO_GL names, that fails
 
-from metrpo.world import mujoco as mujoco  # noqa: E402
+from metrpo.world.tasks import rllab as rllab  # noqa: E402

@@ -17,8 +17,8 @@ from metrpo.config import CollectConfig
 from metrpo.counting import counted
 from metrpo.errors import DivergedError, EpisodeError, NotFiniteError, TaskError, UnplayableError
 from metrpo.types import Episode
-from metrpo.world import returned
-from metrpo.world.returned import representable
+from metrpo.world import env_returns
+from metrpo.world.env_returns import representable
 from metrpo.world.task import Task
 
 Act = Callable[[np.ndarray], np.ndarray]
@@ -90,7 +90,7 @@ def play(
     Raises `EpisodeError` where the environment fails or breaks its promise (`NotFiniteError` where it gives NaN or
     infinity), `TaskError` where the policy is another task's, `DivergedError` where it gives NaN.
     """
-    with returned.closing(task.make_env(), task.name) as env:
+    with env_returns.closing(task.make_env(), task.name) as env:
         for rng in rngs:
             longest_now = int(min(task.horizon if longest is None else longest, at_most))
             episode = _episode(task, env, draw_act(rng), seed_of(rng), longest_now, on_step)
@@ -109,7 +109,7 @@ def evaluate(
     """
     rng = np.random.default_rng(seed)
     returns, steps = list[float](), 0
-    with returned.closing(task.make_env(), task.name) as env:
+    with env_returns.closing(task.make_env(), task.name) as env:
         while len(returns) < episodes and (at_most is None or steps < at_most):
             rewards = _episode(task, env, act, seed_of(rng), longest).rewards
             returns.append(rewards.sum(dtype=np.float64))
@@ -123,7 +123,7 @@ def reset_states(task: Task, count: int, rng: np.random.Generator) -> np.ndarray
     Resets that give NaN or infinity are left out, as in `collect`.
     """
     states, failed = list[np.ndarray](), 0
-    with returned.closing(task.make_env(), task.name) as env:
+    with env_returns.closing(task.make_env(), task.name) as env:
         while len(states) < count:
             try:
                 states.append(_start(task, env, seed_of(rng)))
@@ -170,7 +170,7 @@ def _episode(
         where = f"step {len(actions)} of an episode"
         action = action_of(task, act(state), where)
         with _of_episode(f" (at {where})"):
-            observation, reward, terminated, truncated, _ = returned.after_step(task.name, partial(env.step, action))
+            observation, reward, terminated, truncated, _ = env_returns.after_step(task.name, partial(env.step, action))
         state = _numbers(task, where, observation, reward)
         states.append(state)
         actions.append(action)
@@ -185,7 +185,7 @@ def action_of(task: Task, given: np.ndarray, where: str) -> np.ndarray:
 
     Raises `TaskError` when its size is another than the task's, `DivergedError` when it holds NaN.
     """
-    array = returned.array_of(given)
+    array = env_returns.array_of(given)
     if array is None or array.size != task.action_size or array.ndim > 1:
         got = f"{given!r}" if array is None else f"shape {list(array.shape)}"
         raise TaskError(
@@ -213,18 +213,18 @@ def _of_episode(where: str = "") -> Iterator[None]:
 
 def _start(task: Task, env: gymnasium.Env, seed: int) -> np.ndarray:
     with _of_episode():
-        observation, _ = returned.after_reset(task.name, partial(env.reset, seed=seed))
+        observation, _ = env_returns.after_reset(task.name, partial(env.reset, seed=seed))
     return _numbers(task, "reset()", observation, 0.0)
 
 
 def _numbers(task: Task, where: str, observation: Any, reward: float) -> np.ndarray:
     """The observation as a state [S]; not every environment is `Guarded`: those of a `Task` may come as they are."""
-    state = returned.array_of(observation)
+    state = env_returns.array_of(observation)
     if state is None or state.shape != (task.state_size,):
         got = observation if state is None else f"shape {list(state.shape)}"
         advice = "return an array of so many numbers, or make the task by metrpo.task_of, which flattens others"
         expected = f"an observation of {counted(task.state_size, 'number')}"
-        raise returned.broken(task.name, where, expected, got, advice, EpisodeError)
+        raise env_returns.broken(task.name, where, expected, got, advice, EpisodeError)
     for what, value in (("observation", state), ("reward", reward)):
         if not representable(value):
             raise NotFiniteError(

@@ -26,7 +26,7 @@ class Interface:
 
 
 def of_env(env: gymnasium.Env[Any, Any], name: str) -> Interface:
-    """The interface of an environment with Boxes, or Dicts and Tuples of them, as `world.guard` flattens them."""
+    """The interface of an environment with Boxes, or Dicts and Tuples of them, as `world.env_wrapper` flattens them."""
     actions: Any = env.action_space
     low, high = (tuple(map(float, np.ravel(bound))) for bound in (actions.low, actions.high))
     return Interface(tuple(_parts(env.observation_space, f"the observation of {name}")), low, high)
@@ -52,7 +52,7 @@ def with_positions(interface: Interface, name: str, positions: int) -> Interface
 
 
 def of_paper_task(name: str, action_size: int) -> Interface:
-    """The interface of one of the paper's tasks, whose states `world.mujoco` puts together."""
+    """The interface of one of the paper's tasks, whose states `world.tasks.rllab` puts together."""
     return Interface(_PAPER[name], (-1.0,) * action_size, (1.0,) * action_size)
 
 

@@ -14,8 +14,9 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from metrpo.world.mujoco import _ROOT, MujocoTask, robot_of
 from metrpo.world.registry import get_task
+from metrpo.world.tasks.rllab.bodies import ROOT, robot_of
+from metrpo.world.tasks.rllab.environment import MujocoTask
 
 _FULL = mujoco.mjtState.mjSTATE_FULLPHYSICS
 CHUNK = 2**22
@@ -85,7 +86,7 @@ class OpenLoop:
         return SimpleNamespace(
             qpos=full[..., 1 : 1 + nq],  # time stands first
             qvel=full[..., 1 + nq : 1 + nq + nv],
-            subtree_com={_ROOT: sensor("com")},
-            subtree_linvel={_ROOT: sensor("velocity")},
+            subtree_com={ROOT: sensor("com")},
+            subtree_linvel={ROOT: sensor("velocity")},
             geom_xpos=heads,
         )

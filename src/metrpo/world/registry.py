@@ -10,9 +10,9 @@ import gymnasium
 
 from metrpo.errors import TaskError
 from metrpo.world.interface import with_positions
-from metrpo.world.known import KNOWN
 from metrpo.world.resolve import resolve, task_of
 from metrpo.world.task import Task
+from metrpo.world.tasks.gymnasium_formulas import KNOWN
 
 _TASKS: dict[str, Task] = {}
 
@@ -30,7 +30,7 @@ def tasks() -> dict[str, Task]:
 
 def get_task(name: str) -> Task:
     """The task of that name: a registered one (case does not matter), one that comes with its formulas
-    (`metrpo.world.known`), or what `metrpo.world.resolve` makes of it.
+    (`metrpo.world.tasks.gymnasium_formulas`), or what `metrpo.world.resolve` makes of it.
 
     Raises `TaskError` with the nearest names when there is none, and when an environment cannot be used.
     """

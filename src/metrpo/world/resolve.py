@@ -17,9 +17,9 @@ import gymnasium
 
 from metrpo.errors import MissingTaskError, TaskError
 from metrpo.types import Array
-from metrpo.world import interface, returned
-from metrpo.world.guard import Guarded
-from metrpo.world.limits import require_horizon
+from metrpo.world import env_returns, interface
+from metrpo.world.env_wrapper import Guarded
+from metrpo.world.size_limits import require_horizon
 from metrpo.world.task import Task
 
 _DM_CONTROL_STEPS = 1000
@@ -49,7 +49,7 @@ def task_of(
     """
     called = name or (env if isinstance(env, str) else str(getattr(env, "__name__", type(env).__name__)))
     make = partial(_make, env, called, horizon)
-    with returned.closing(make(), called) as with_limit:
+    with env_returns.closing(make(), called) as with_limit:
         if with_limit.time_limit is not None:
             require_horizon(called, with_limit.time_limit)
         state, _ = with_limit.reset(seed=0)

@@ -10,9 +10,9 @@ import gymnasium
 
 from metrpo.errors import TaskError
 from metrpo.types import Array
-from metrpo.world.guard import refuse_running_statistics
+from metrpo.world.env_wrapper import refuse_running_statistics
 from metrpo.world.interface import Interface
-from metrpo.world.limits import require_horizon, require_size
+from metrpo.world.size_limits import require_horizon, require_size
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Task:
     def make_env(self, **kwargs: Any) -> gymnasium.Env:
         """A fresh environment with the time limit of the task (`kwargs` such as `render_mode="rgb_array"`).
 
-        Raises `TaskError` when there is none, and for wrappers with running statistics (`world.guard`).
+        Raises `TaskError` when there is none, and for wrappers with running statistics (`world.env_wrapper`).
         """
         made = self._made(**kwargs)
         refuse_running_statistics(made, self.name)

@@ -9,7 +9,7 @@ import numpy as np
 
 from metrpo.world import collect
 from metrpo.world.collect import Act
-from metrpo.world.limits import RECORDED
+from metrpo.world.size_limits import RECORDED
 from metrpo.world.task import Task
 
 EPISODES, STEPS = 10, 10_000

@@ -1,0 +1,282 @@
+"""Stochastic value gradients in the real environment (Heess et al. 2015; settings: the paper, appendix "Baselines").
+
+After every real episode the model is trained on all data so far, and the policy takes one gradient step along that
+very episode: the noise of the policy and of the environment is inferred from what happened, so that the model is asked
+for its derivatives only, never for rollouts of its own. SVG(inf) differentiates the return of the whole episode, SVG(1)
+one step of it followed by a learned value.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+
+from metrpo import budget
+from metrpo.algorithm import Row, recorded_returns, task_for
+from metrpo.baselines import on_policy
+from metrpo.config import Config
+from metrpo.console.progress import SILENT, Progress
+from metrpo.errors import ConfigError
+from metrpo.model import ensemble as ensembles
+from metrpo.model.ensemble import Ensemble, Networks, predict
+from metrpo.model.epochs import loss_of, minibatch
+from metrpo.policy import gaussian
+from metrpo.policy.advantage import discounted_returns
+from metrpo.policy.gaussian import Policy
+from metrpo.policy.improvers.adam import ascend, init_moments
+from metrpo.run.clock import Clock
+from metrpo.seeds import Stage, key_of, rng_of
+from metrpo.types import Array, Episode, Normaliser, Transitions
+from metrpo.world import dataset as datasets
+from metrpo.world.task import Task
+
+_VALUE_HIDDEN = (64, 64)
+
+
+class State(NamedTuple):
+    """Everything that an iteration hands to the next; `*_moments` are Adam's, which go on from episode to episode."""
+
+    iteration: int
+    real_steps: int
+    policy: Policy
+    policy_moments: Any
+    networks: Networks
+    model_moments: Any
+    value: Policy
+    """SVG(1): a network from state and time to value, in its `layers`."""
+    value_moments: Any
+    replay: Transitions
+
+
+class Path(NamedTuple):
+    """One real episode, padded to the horizon T."""
+
+    states: Array
+    """[T + 1, S]"""
+    drawn: Array
+    """[T, A], actions before clipping."""
+    rewards: Array
+    """[T]"""
+    mask: Array
+    """[T], 1 within the episode."""
+
+
+def init(config: Config) -> State:
+    """The state before the first iteration."""
+    task, p, e = task_for(config), config.policy, config.ensemble
+    if task.reward is None:
+        raise ConfigError(f"method: svg needs the reward of {task.name} as a formula, got a task that learns it")
+    keys = jax.random.split(key_of(config.seed, 0, Stage.INIT), 3)
+    policy = gaussian.init(keys[0], task.state_size, task.action_size, p.hidden, p.initial_std)
+    networks = ensembles.init(keys[1], 1, task.state_size, task.action_size, e.hidden)
+    value = gaussian.init(keys[2], task.state_size + 1, 1, _VALUE_HIDDEN, 1.0)
+    return State(
+        iteration=0,
+        real_steps=0,
+        policy=policy,
+        policy_moments=init_moments(policy, config.gradient),
+        networks=networks,
+        model_moments=optax.adam(config.fit.learning_rate).init(networks),
+        value=value,
+        value_moments=optax.adam(config.svg.value_learning_rate).init(value),
+        replay=datasets.empty(task.state_size, task.action_size).train,
+    )
+
+
+def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
+    """Episodes of `config.collect.steps` real steps together, each followed by training the model and the policy."""
+    task, iteration, clock = task_for(config), state.iteration + 1, Clock()
+    rng, key = rng_of(config.seed, iteration, Stage.COLLECT), key_of(config.seed, iteration, Stage.IMPROVE)
+    collected: list[Episode] = []
+    losses, norms, finite = [], [], []
+    enough, left = budget.steps_wanted(config, state.real_steps), budget.steps_left(config, state.real_steps)
+    progress.stage("learn", enough)
+    while (steps := sum(len(e.rewards) for e in collected)) < enough:
+        with clock("collect"):
+            drawn = on_policy.collect(task, state.policy, 1, rng, longest=config.collect.steps, at_most=left - steps)
+            collected += drawn.episodes
+            state = state._replace(replay=datasets.append(state.replay, drawn.episodes, config.collect.max_train))
+            path = _path(drawn.episodes[0].states, drawn.actions[0], drawn.episodes[0].rewards, task.horizon)
+        normaliser = _normaliser(config, task, state.replay)
+        with clock("fit"):
+            replay = jax.device_put(datasets.with_capacity(state.replay, config.collect.max_train))
+            state, loss = _fit(config, state, normaliser, replay, jax.random.fold_in(key, steps))
+            jax.block_until_ready(state.networks)
+        with clock("improve"):
+            state, norm, made = _improve(config, task, state, normaliser, path)
+        losses.append(float(loss))
+        norms.append(float(norm))
+        finite.append(bool(made))
+        progress.update(steps, f"model loss {losses[-1]:.3g}, gradient {norms[-1]:.3g}")
+    steps = sum(len(e.rewards) for e in collected)
+    with clock("evaluate"):
+        progress.stage("evaluate", config.evaluation_episodes)
+        returns = recorded_returns(config, task, state.policy, iteration)
+    state = state._replace(iteration=iteration, real_steps=state.real_steps + steps)
+    row = {
+        "iteration": iteration,
+        "real_steps": state.real_steps,
+        "return_real": float(np.mean(returns)),
+        "return_real_std": float(np.std(returns)),
+        "return_collected": float(np.mean([e.rewards.sum() for e in collected])),
+        "train_loss": float(np.mean(losses)),
+        "updates": len(collected),
+        "rejected_steps": int(np.sum(~np.array(finite))),
+        "gradient_norm": float(np.mean(norms)),
+        "mean_std": float(np.mean(np.exp(np.asarray(state.policy.log_std)))),
+        **clock.row(),
+    }
+    return state, row
+
+
+def value_gradient(
+    task: Task, ensemble: Ensemble, policy: Policy, path: Path, discount: float, value: Policy | None = None
+) -> Policy:
+    """The gradient of the path's discounted return with respect to the policy's parameters, the noise held fixed.
+
+    Without `value` through the whole path (SVG(inf)); with it, the sum over the path's steps of the gradient of
+    r + discount x value of the next state, the states visited being given (SVG(1)).
+    """
+    time = jnp.arange(path.mask.size)
+    residuals, noise = _inferred(ensemble, policy, path)
+
+    reward_of: Any = task.reward
+
+    def one(policy: Policy, state: Array, noise: Array, residual: Array) -> tuple[Array, Array]:
+        action = jnp.clip(gaussian.mean(policy, state) + jnp.exp(policy.log_std) * noise, -1.0, 1.0)
+        following = _predict(ensemble, state, action) + residual
+        return following, reward_of(state, action, following)
+
+    def whole(policy: Policy) -> Array:
+        def step(state: Array, given: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
+            noise, residual, mask, weight = given
+            following, reward = one(policy, state, noise, residual)
+            return jnp.where(mask > 0, following, state), mask * weight * reward
+
+        return jnp.sum(jax.lax.scan(step, path.states[0], (noise, residuals, path.mask, discount**time))[1])
+
+    def by_steps(policy: Policy) -> Array:
+        following, rewards = jax.vmap(partial(one, policy))(path.states[:-1], noise, residuals)
+        # The last step of the horizon has nothing after it.
+        going_on = jnp.append(path.mask[1:], 0.0)
+        after = _value(value, ensemble.normaliser, following, time + 1) if value is not None else 0.0
+        return jnp.sum(path.mask * (rewards + discount * going_on * after))
+
+    return jax.grad(whole if value is None else by_steps)(policy)
+
+
+def _inferred(ensemble: Ensemble, policy: Policy, path: Path) -> tuple[Array, Array]:
+    """What the model missed [T, S] and the policy's noise [T, A], such that both replay the path exactly."""
+    states = path.states[:-1]
+    predicted = jax.vmap(partial(_predict, ensemble))(states, jnp.clip(path.drawn, -1.0, 1.0))
+    noise = (path.drawn - gaussian.mean(policy, states)) * jnp.exp(-policy.log_std)
+    return path.states[1:] - predicted, noise
+
+
+def _predict(ensemble: Ensemble, state: Array, action: Array) -> Array:
+    return predict(ensemble, state[None, None], action[None, None])[0, 0]
+
+
+def _value(value: Policy, normaliser: Normaliser, states: Array, time: Array) -> Array:
+    """[n], of states [n, S] after `time` [n] steps."""
+    seen = (states - normaliser.state_mean) * normaliser.state_scale
+    return gaussian.mean(value, jnp.concatenate([seen, time[:, None] / 100.0], axis=-1))[:, 0]
+
+
+def _path(states: np.ndarray, drawn: np.ndarray, rewards: np.ndarray, horizon: int) -> Path:
+    missing = horizon - len(rewards)
+    return Path(
+        np.concatenate([states, np.repeat(states[-1:], missing, axis=0)]).astype(np.float32),
+        np.concatenate([drawn, np.zeros((missing, drawn.shape[1]), np.float32)]),
+        np.append(rewards, np.zeros(missing, np.float32)),
+        (np.arange(horizon) < len(rewards)).astype(np.float32),
+    )
+
+
+def _normaliser(config: Config, task: Task, replay: Transitions) -> Normaliser:
+    e = config.ensemble
+    return ensembles.normaliser_of(replay, e.std_floor, e.delta_std_floor, task.unseen)
+
+
+def _fit(config: Config, state: State, normaliser: Normaliser, replay: Transitions, key: Array) -> tuple[State, Array]:
+    settings = (config.fit.learning_rate, config.fit.batch_size, config.fit.loss_units, config.svg.model_steps)
+    networks, moments, loss = _train_model(settings, state.networks, state.model_moments, normaliser, replay, key)
+    return state._replace(networks=networks, model_moments=moments), loss
+
+
+@partial(jax.jit, static_argnames="settings")
+def _train_model(
+    settings: tuple[float, int, str, int],
+    networks: Networks,
+    moments: Any,
+    normaliser: Normaliser,
+    replay: Transitions,
+    key: Array,
+) -> tuple[Networks, Any, Array]:
+    learning_rate, batch_size, loss_units, steps = settings
+    optimizer = optax.adam(learning_rate)
+
+    def loss(networks: Networks, *batch: Array) -> Array:
+        return jnp.mean(loss_of(Ensemble(networks, normaliser), loss_units, *batch))
+
+    def step(carry: tuple[Networks, Any], key: Array) -> tuple[tuple[Networks, Any], Array]:
+        networks, moments = carry
+        index = minibatch(key, jnp.arange(1), batch_size, replay.size)
+        now, gradient = jax.value_and_grad(loss)(networks, *(jnp.take(x, index, axis=0) for x in replay[:3]))
+        change, moments = optimizer.update(gradient, moments)
+        return (optax.apply_updates(networks, change), moments), now
+
+    (networks, moments), losses = jax.lax.scan(step, (networks, moments), jax.random.split(key, steps))
+    return networks, moments, jnp.mean(losses)
+
+
+def _improve(
+    config: Config, task: Task, state: State, normaliser: Normaliser, path: Path
+) -> tuple[State, Array, Array]:
+    relevant = Config(task=task.name, gradient=config.gradient, svg=config.svg, advantage=config.advantage)
+    learned, norm, made = _train_policy(
+        relevant,
+        task,
+        Ensemble(state.networks, normaliser),
+        (state.policy, state.policy_moments, state.value, state.value_moments),
+        path,
+    )
+    policy, policy_moments, value, value_moments = learned
+    changed = state._replace(policy=policy, policy_moments=policy_moments, value=value, value_moments=value_moments)
+    return changed, norm, made
+
+
+@partial(jax.jit, static_argnames=("config", "task"))
+def _train_policy(
+    config: Config, task: Task, ensemble: Ensemble, learned: tuple[Policy, Any, Policy, Any], path: Path
+) -> tuple[tuple[Policy, Any, Policy, Any], Array, Array]:
+    policy, moments, value, value_moments = learned
+    discount = config.advantage.discount
+    if config.svg.horizon == "1":
+        value, value_moments = _train_value(config, ensemble.normaliser, value, value_moments, path)
+        gradient = value_gradient(task, ensemble, policy, path, discount, value)
+    else:
+        gradient = value_gradient(task, ensemble, policy, path, discount)
+    policy, moments, made = ascend(policy, moments, gradient, config.gradient)
+    return (policy, moments, value, value_moments), optax.tree.norm(gradient), made
+
+
+def _train_value(config: Config, normaliser: Normaliser, value: Policy, moments: Any, path: Path) -> tuple[Policy, Any]:
+    """The value network fitted to the path's own returns to go, which are the policy's."""
+    optimizer = optax.adam(config.svg.value_learning_rate)
+    returns = discounted_returns(path.rewards[:, None], path.mask[:, None], config.advantage.discount)[:, 0]
+
+    def loss(value: Policy) -> Array:
+        errors = _value(value, normaliser, path.states[:-1], jnp.arange(path.mask.size)) - returns
+        return jnp.sum(path.mask * jnp.square(errors)) / jnp.sum(path.mask)
+
+    def step(_: Array, carry: tuple[Policy, Any]) -> tuple[Policy, Any]:
+        change, moments = optimizer.update(jax.grad(loss)(carry[0]), carry[1])
+        return optax.apply_updates(carry[0], change), moments
+
+    return jax.lax.fori_loop(0, config.svg.value_steps, step, (value, moments))

@@ -1,0 +1,54 @@
+"""Whether a run is healthy, in plain words: what was measured, since when, what it means and what helps.
+
+Pure functions from the rows of metrics.csv and the settings to a list of concerns. docs/report.md says on how many of
+the runs under results/ each one fires.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+
+import numpy as np
+
+from metrpo.checks import model_checks, policy_checks
+from metrpo.checks.finding import Concern
+from metrpo.config import Config
+from metrpo.run.metrics import Row
+
+CHECKS: tuple[Callable[[Sequence[Row], Config], Concern | None], ...] = (
+    model_checks.not_finite,
+    model_checks.model_exploited,
+    policy_checks.not_evaluated,
+    policy_checks.return_fell,
+    policy_checks.no_improvement,
+    model_checks.diverged,
+    policy_checks.updates_rejected,
+    policy_checks.std_collapsed,
+    policy_checks.saturated,
+    model_checks.models_blind,
+    model_checks.unfit_dimensions,
+    model_checks.member_apart,
+    model_checks.loss_rises,
+    policy_checks.never_stopped,
+    policy_checks.nothing_accepted,
+    model_checks.end_untrusted,
+    policy_checks.few_episodes,
+    policy_checks.failed_episodes,
+)
+"""Extend them by adding a row."""
+
+
+def examine(
+    rows: Sequence[Row], config: Config, yardsticks: Mapping[str, float] = MappingProxyType({})
+) -> list[Concern]:
+    """What there is to say about a run that has these rows, warnings first; nothing where it is healthy.
+
+    `yardsticks` are the returns of ways to act that have learned nothing, by name.
+    """
+    if not rows:
+        return []
+    with np.errstate(all="ignore"):  # what is not finite has a sign of its own
+        signs = [*(check(rows, config) for check in CHECKS), policy_checks.no_skill(rows, config, yardsticks)]
+    found = [sign for sign in signs if sign is not None]
+    return sorted(found, key=lambda concern: concern.level != "warning")

@@ -1,0 +1,141 @@
+"""One outer iteration in separate steps, where another program plays the episodes: a robot's own, say.
+
+    begin(config, DIR)        writes the untrained policy
+    repeat:
+        DIR/policy.npz        plays; its episodes come back by `append_episode`, from a log, or by `collect`
+        improve(DIR)          learns from all that have come, and writes the next policy
+
+Each step leaves the run directory as `train` does, which may go on with it, and the other way round.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from metrpo import algorithm, budget
+from metrpo.algorithm import State
+from metrpo.config import Config
+from metrpo.console.progress import SILENT, Progress
+from metrpo.errors import ConfigError, RunDirectoryError
+from metrpo.run import task_file
+from metrpo.run.directory import RunDirectory, stored_config
+from metrpo.run.memory import require_memory
+from metrpo.run.metrics import Row
+from metrpo.training import check
+from metrpo.types import Episode
+from metrpo.world import offline_data
+from metrpo.world.registry import get_task
+
+
+def begin(config: Config, run_dir: str | Path) -> None:
+    """Makes `run_dir` a run that has learned nothing yet; its policy can play at once.
+
+    Raises `RunDirectoryError` when `run_dir` cannot be used or holds a run, `TaskError` and `ConfigError` as `train`.
+    """
+    state = _ours(config)
+    with RunDirectory(run_dir, config) as run:
+        if run.load(state) is not None:
+            raise RunDirectoryError(f"{run_dir} holds a run already: go on with metrpo improve, or choose another")
+        check(config)
+        task_file.remember(run_dir, config.task)
+        run.begin(state)
+
+
+def collect(
+    run_dir: str | Path,
+    at_least: int | None = None,
+    data: str | Path | None = None,
+    progress: Progress = SILENT,
+    task: str | None = None,
+) -> list[Episode]:
+    """Adds real episodes to those that wait, and returns all that do.
+
+    Plays the environment with exploration until the waiting episodes have `at_least` steps (default: the config's
+    `collect.steps`, within its budget of real steps), or reads offline data (`world.offline_data`) and adds what does
+    not wait yet. `task` says where the run's task is, if its file has moved.
+
+    Raises `RunDirectoryError` when `run_dir` holds no run, `TaskError` when the task has no environment to play,
+    `ConfigError` when the budget is spent and `at_least` does not ask for more.
+    """
+    config = stored_config(run_dir)
+    _settle(run_dir, config.task, task)
+    with RunDirectory(run_dir, config) as run:
+        state = _state(run, config)
+        if data is not None:
+            waiting = Counter(map(_content, run.episodes.pending()))
+            for episode in offline_data.load(data, algorithm.task_for(config)):
+                if waiting[_content(episode)]:  # added already, when this was stopped half-way
+                    waiting[_content(episode)] -= 1
+                else:
+                    run.episodes.append(episode)
+            return run.episodes.pending()
+        algorithm.task_for(config).require_playable()
+        if at_least is None and budget.steps_left(config, state.real_steps) == 0:
+            raise ConfigError(
+                f"real_steps: the budget of {run_dir}, {config.real_steps:,}, is spent; to play more all the same: "
+                f"metrpo collect {run_dir} --steps {config.collect.steps}"
+            )
+        progress.begin(state.iteration + 1, None)
+        try:
+            return algorithm.collect(config, state, progress, run.episodes, at_least)
+        finally:
+            progress.close()
+
+
+def improve(run_dir: str | Path, progress: Progress = SILENT, task: str | None = None) -> Row:
+    """Learns from the episodes that wait, one outer iteration, and returns its row of metrics.
+
+    `task` says where the run's task is, if its file has moved. Raises `RunDirectoryError` when `run_dir` holds no run,
+    or no episodes wait.
+    """
+    config = stored_config(run_dir)
+    _settle(run_dir, config.task, task)
+    with RunDirectory(run_dir, config) as run:
+        state = _state(run, config)
+        episodes = run.episodes.pending()
+        if not episodes:
+            raise RunDirectoryError(
+                f"{run_dir}: expected episodes to learn from, got none; add some with metrpo collect {run_dir}, "
+                "or metrpo.append_episode in your robot's program"
+            )
+        progress.begin(state.iteration + 1, None)
+        try:
+            failed = algorithm.left_out(run.episodes)
+            written = run.save(*algorithm.learn(config, state, episodes, progress, None, failed))
+            progress.end(written, None)
+        finally:
+            progress.close()
+    return written
+
+
+def _settle(run_dir: str | Path, name: str, where: str | None) -> None:
+    """Makes the run's task known under its name, from its file's old place or the new one."""
+    if where is None:
+        task_file.task_of_run(run_dir, name)
+    else:
+        task_file.moved(name, where)
+
+
+def _content(episode: Episode) -> tuple[bytes | bool, ...]:
+    # Files of earlier versions hold float32.
+    return (
+        np.asarray(episode.states, np.float64).tobytes(),
+        episode.actions.tobytes(),
+        episode.rewards.tobytes(),
+        episode.terminated,
+    )
+
+
+def _ours(config: Config) -> State:
+    if config.method != "model-based":
+        raise ConfigError(f"system: expected one that learns models, got {config.system}; it runs by metrpo train only")
+    require_memory(config, get_task(config.task))
+    return algorithm.init(config)
+
+
+def _state(run: RunDirectory, config: Config) -> State:
+    state = _ours(config)
+    return run.load(state) or state

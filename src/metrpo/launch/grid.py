@@ -1,0 +1,156 @@
+"""A grid of runs: every task with every system, seed and combination of settings, each an ordinary `metrpo train`."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast, get_args
+
+from metrpo.config import BUDGET_FIELDS, Preset, System
+from metrpo.errors import ConfigError
+from metrpo.launch.run_spec import RunSpec
+from metrpo.world.registry import get_task
+
+if TYPE_CHECKING:
+    pass
+
+_LONGEST, _KEPT = 255, 180
+"""Bytes that a folder's name may have on common disks, and how many of a longer one stay readable."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """What is combined with what."""
+
+    tasks: tuple[str, ...]
+    systems: tuple[str, ...] = ("me-trpo",)
+    seeds: tuple[int, ...] = (0,)
+    preset: Preset = "fast"
+    settings: Mapping[str, Sequence[Any]] = field(default_factory=dict)
+    """Dotted setting -> its values."""
+    iterations: int | None = None
+    real_steps: int | None = None
+    """The budget of every run, one of the two; default: the preset's. It names no folder, for it may be raised."""
+
+    def runs(self) -> list[RunSpec]:
+        """Every run of the grid, first seeds first.
+
+        Raises `ConfigError` or `TaskError` for what cannot be run, before anything is: an unknown setting or task, an
+        impossible value.
+        """
+        names, columns = list(self.settings), [list(values) for values in self.settings.values()]
+        if not self.tasks or not self.systems or not self.seeds or not all(columns):
+            raise ConfigError("sweep: expected at least one task, system, seed and value of each setting, got none")
+        budget = tuple((n, v) for n in BUDGET_FIELDS if (v := getattr(self, n)) is not None)
+        if len(budget) > 1:
+            raise ConfigError("sweep: expected iterations or real_steps, got both; leave one out")
+        if twice := [name for name in names if budget and name in BUDGET_FIELDS]:
+            raise ConfigError(
+                f"set: {twice[0]}: expected the budget in one place, got it as an option too; leave one out"
+            )
+        if unknown := [s for s in self.systems if s not in get_args(System)]:
+            raise ConfigError(f"sweep: systems: expected some of {', '.join(get_args(System))}, got {unknown[0]}")
+        found = []
+        tasks = [get_task(task).name for task in self.tasks]
+        for seed, task, system, values in itertools.product(
+            self.seeds, tasks, self.systems, itertools.product(*columns)
+        ):
+            overrides = tuple((name, _hashable(value)) for name, value in zip(names, values, strict=True))
+            variant = _variant(system, overrides)
+            found.append(RunSpec(task, system, seed, budget + overrides, self.preset, variant))
+        for run in found:
+            _ = run.config
+        return list(dict.fromkeys(found))
+
+
+def from_file(path: Path) -> Grid:
+    """The grid in a TOML file: tasks, systems, seeds (a list or "0:5"), preset, budget, and a table [set] of settings.
+
+    Raises `ConfigError` when it cannot be read or says something else.
+    """
+    try:
+        spec = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{path}: expected a TOML file with tasks, seeds and [set], got {error}") from error
+    settings = spec.pop("set", {})
+    plain = ("preset", *BUDGET_FIELDS)
+    if unknown := [key for key in spec if key not in ("tasks", "systems", "seeds", *plain)]:
+        raise ConfigError(f"{path}: expected tasks, systems, seeds, {', '.join(plain)} and [set], got {unknown[0]}")
+    if isinstance(spec.get("seeds"), str):
+        spec["seeds"] = seeds_of(spec["seeds"])
+    if not isinstance(settings, dict) or not all(isinstance(spec.get(k, []), list | tuple) for k in ("tasks", "seeds")):
+        raise ConfigError(f"{path}: expected lists of tasks and seeds, and a table [set]")
+    lists = {key: value if key in plain else tuple(value) for key, value in spec.items()}
+    columns = {name: value if isinstance(value, list) else [value] for name, value in flat(settings).items()}
+    return Grid(**cast(Any, {"tasks": (), **lists, "settings": columns}))
+
+
+def require_once(option: str, names: Sequence[str]) -> None:
+    """Raises `ConfigError` when an option is to set something twice."""
+    if len(set(names)) < len(names):
+        raise ConfigError(f"{option}: expected each setting once, got {', '.join(names)}")
+
+
+def seeds_of(text: str) -> tuple[int, ...]:
+    """Seeds as typed: "3" is 3, "0:5" is 0 to 4, "0,2,7" these, each once. Raises `ConfigError` for anything else."""
+    found: list[int] = []
+    for part in text.split(","):
+        first, colon, end = part.partition(":")
+        try:
+            found += range(int(first or 0), int(end)) if colon else [int(part)]
+        except ValueError:
+            found.append(-1)
+    if not found or min(found) < 0:
+        raise ConfigError(f"seeds: expected a number, a range such as 0:5 or a list such as 0,2,7, got {text!r}")
+    return tuple(dict.fromkeys(found))
+
+
+def values_of(text: str) -> tuple[str, list[Any]]:
+    """A setting with its values as typed: "ensemble.members=1,5,10", "ensemble.hidden=[200,200],[512,512]"."""
+    name, equals, values = text.partition("=")
+    if not equals or not name or not values:
+        raise ConfigError(f"set: expected NAME=VALUE,VALUE,... such as ensemble.members=1,5,10, got {text!r}")
+    try:
+        return name, json.loads(f"[{values}]")
+    except json.JSONDecodeError:
+        return name, [_plain(word) for word in values.split(",")]
+
+
+def _plain(word: str) -> Any:
+    try:
+        return (
+            {"True": True, "False": False, "None": None}[word]
+            if word in ("True", "False", "None")
+            else json.loads(word)
+        )
+    except json.JSONDecodeError:
+        return word
+
+
+def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """TOML's ensemble.members is a table in a table."""
+    found: dict[str, Any] = {}
+    for name, value in table.items():
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return found
+
+
+def _hashable(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value
+
+
+def _variant(system: str, overrides: tuple[tuple[str, Any], ...]) -> str:
+    """The folder of a combination, in words: "me-trpo,ensemble.members=5"; a hash stands for the end of a long one."""
+
+    def word(value: Any) -> str:
+        return "x".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+    name = ",".join([system, *(f"{name}={word(value)}" for name, value in overrides)]).replace("/", "-")
+    if len(encoded := name.encode()) <= _LONGEST:
+        return name
+    return f"{encoded[:_KEPT].decode(errors='ignore')},{hashlib.sha256(encoded).hexdigest()[:16]}"

@@ -1,0 +1,1 @@
+"""The comparisons of the paper: which runs, which axes, and what they show."""

@@ -1,0 +1,147 @@
+"""The figures as pictures: mean over seeds with a band, in the paper's names; drawn from whatever has been run."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from metrpo.launch.run_spec import RunSpec
+from metrpo.paper.figures import FIGURES, PAPER_REAL_STEPS, PAPER_SECONDS, Figure
+from metrpo.paper.summary import Curves, curves_of, mean_curve
+from metrpo.run.files import atomic_write
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure as Picture
+
+_COLOURS = ("#1f5fa8", "#d9772b", "#3f8f5f", "#b0413e", "#7a5aa6", "#8a6d3b")
+_REAL, _IMAGINED = _COLOURS[:2]
+_COLUMNS = 3
+"""Panels side by side, so that a page's width still shows them."""
+
+
+def draw(name: str, runs: Sequence[RunSpec], out: Path, path: Path) -> bool:
+    """Draws a figure from the runs that have begun, PNG, atomic; False, and no file, when none has.
+
+    Raises `RunDirectoryError` when it cannot be written.
+    """
+    from matplotlib.figure import Figure as Picture  # slow to import
+
+    curves = curves_of(name, runs, out)
+    if not curves:
+        return False
+    picture = Picture(dpi=130, layout="constrained")
+    _KINDS[FIGURES[name].kind](picture, FIGURES[name], curves)
+    picture.suptitle(FIGURES[name].title, fontsize=13, fontweight="bold")
+    content = io.BytesIO()
+    picture.savefig(content, format="png", metadata={"Software": None})
+    atomic_write(path, content.getvalue())
+    return True
+
+
+def _draw_curves(picture: Picture, figure: Figure, curves: list[Curves]) -> None:
+    tasks = list(dict.fromkeys(c.task for c in curves))
+    columns = min(len(tasks), _COLUMNS)
+    picture.set_size_inches(max(5.2 * columns, 6.5), 0.5 + 4.4 * -(-len(tasks) // _COLUMNS))
+    labels = list(figure.systems)
+    for axes, task in zip(_panels(picture, len(tasks)), tasks, strict=True):
+        for c in (c for c in curves if c.task == task):
+            _draw_band(axes, c, _COLOURS[labels.index(c.label)], figure.log_steps)
+        axes.set_title(task, fontsize=11)
+        axes.set_xlabel("real steps" if figure.log_steps else "real steps (thousands)")
+        axes.set_ylabel("return")
+        if figure.log_steps:
+            _logarithmic(axes)
+    handles: dict[str, Any] = {}
+    for axes in picture.axes:
+        lines, names = axes.get_legend_handles_labels()
+        handles |= dict(zip(names, lines, strict=True))
+    shown = [label for label in labels if label in handles]
+    picture.legend([handles[s] for s in shown], shown, loc="outside lower center", ncols=6, frameon=False, fontsize=9)
+
+
+def _draw_band(axes: Axes, curves: Curves, colour: str, log: bool) -> None:
+    unit = 1 if log else 1000
+    for steps, returns in curves.column("return_real"):
+        axes.plot(steps / unit, returns, color=colour, linewidth=0.7, alpha=0.35)
+    steps, mean, low, high = mean_curve(curves, "return_real", log)
+    axes.fill_between(steps / unit, low, high, color=colour, alpha=0.15, linewidth=0)
+    axes.plot(steps / unit, mean, color=colour, linewidth=2, label=curves.label)
+
+
+def _draw_overfitting(picture: Picture, figure: Figure, curves: list[Curves]) -> None:
+    """Imagined and real return after every policy phase: a row for each system, a column for each seed."""
+    columns = max(len(c.runs) for c in curves)
+    picture.set_size_inches(4.2 * columns, 3.1 * len(curves))
+    grid = picture.subplots(len(curves), columns, squeeze=False)
+    for row, c in zip(grid, curves, strict=True):
+        for axes, (steps, real), (_, imagined), run in zip(
+            row, c.column("return_real"), c.column("return_imagined"), c.runs, strict=False
+        ):
+            axes.plot(steps / 1000, imagined, "s-", color=_IMAGINED, markersize=4, label="imagined")
+            axes.plot(steps / 1000, real, "o-", color=_REAL, markersize=4, label="real")
+            axes.set_title(f"{c.task}, {c.label}, seed {run.seed}", fontsize=10)
+            axes.set_ylabel("return")
+            axes.set_xlabel("real steps (thousands)")
+            _tidy(axes)
+        for axes in row[len(c.runs) :]:
+            axes.set_axis_off()
+    grid[0][0].legend(frameon=False, fontsize=9)
+
+
+def _draw_wall_clock(picture: Picture, figure: Figure, curves: list[Curves]) -> None:
+    """Seconds per 1,000 real steps, ours and the paper's: the runs differ in length."""
+    picture.set_size_inches(8, 4.2)
+    axes = _panels(picture, 1)[0]
+    for i, c in enumerate(curves):
+        ours = [seconds[-1] / steps[-1] * 1000 for steps, seconds in c.column("wall_seconds")]
+        theirs = PAPER_SECONDS[c.task] / PAPER_REAL_STEPS[c.task] * 1000
+        for values, colour, label in (
+            (ours, _REAL, "these runs"),
+            ([theirs], "#8a8f98", "paper (1 K80, 4 virtual CPUs)"),
+        ):
+            axes.plot([i] * len(values), values, "o", color=colour, label=None if i else label)
+            note = f"{float(np.mean(values)):.3g}"
+            axes.annotate(note, (i, values[0]), xytext=(8, -3), textcoords="offset points", fontsize=9)
+    axes.set_xticks(range(len(curves)), [c.task for c in curves])
+    axes.set_yscale("log")
+    axes.set_ylabel("seconds per 1,000 real steps")
+    axes.legend(frameon=False, fontsize=9)
+
+
+_KINDS: dict[str, Callable[[Picture, Figure, list[Curves]], None]] = {
+    "curves": _draw_curves,
+    "overfitting": _draw_overfitting,
+    "wall-clock": _draw_wall_clock,
+}
+
+
+def _panels(picture: Picture, count: int) -> list[Axes]:
+    columns = min(count, _COLUMNS)
+    panels = list(picture.subplots(-(-count // columns), columns, squeeze=False).flat)
+    for axes in panels:
+        _tidy(axes)
+    for axes in panels[count:]:
+        axes.set_axis_off()
+    return panels[:count]
+
+
+def _logarithmic(axes: Axes) -> None:
+    """Real steps by powers of ten, with few enough labels for a panel of less than one."""
+    from matplotlib.ticker import EngFormatter, LogLocator
+
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.xaxis.set_minor_locator(LogLocator(subs="all"))
+    axes.xaxis.set_minor_formatter("")
+
+
+def _tidy(axes: Axes) -> None:
+    axes.grid(True, color="#dddddd", linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)

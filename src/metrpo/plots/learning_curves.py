@@ -1,0 +1,129 @@
+"""Learning curves as a picture: a panel for each task, a line with a band over the seeds for each group of runs."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from metrpo.counting import counted
+from metrpo.errors import ConfigError
+from metrpo.plots.bands import RATIOS, curve, is_far
+from metrpo.run.files import atomic_write
+from metrpo.run.find import SeenRun, group
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+X = Literal["real_steps", "wall_seconds", "iteration"]
+FORMATS = ("png", "svg", "pdf")
+_DOTS = 25
+"""Most points of a line that are marked each."""
+
+_COLOURS = ("#1f5fa8", "#d9772b", "#3f8f5f", "#b0413e", "#7a5aa6", "#8a6d3b")
+_NAMES = {
+    "real_steps": "real steps",
+    "wall_seconds": "wall-clock time (s)",
+    "return_real": "real return",
+    "return_imagined": "imagined return",
+    "return_collected": "collected return",
+    "gap": "gap: imagined minus real return",
+    "fraction_improved": "share of the models that improved",
+    "error_1": "model error after 1 step\n(1: as predicting no change)",
+    "error_T": "model error after an imagined episode\n(1: as predicting no change)",
+    "disagreement_real": "disagreement on real states (std)",
+    "disagreement_imagined": "disagreement on imagined states (std)",
+    "outside": "imagined states outside the data",
+    "saturated": "mean actions beyond the limits",
+}
+
+
+def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "return_real") -> Path:
+    """Draws the column `y` against `x` to `path` (.png, .svg or .pdf), atomically, and returns it.
+
+    `y` is one of metrics.csv or of diagnostics.csv. Raises `ConfigError` when the file has another ending or no run has
+    both columns, `RunDirectoryError` when it cannot be written.
+    """
+    kind = path.suffix.removeprefix(".").lower()
+    if kind not in FORMATS:
+        raise ConfigError(f"out: expected a file name that ends in .png, .svg or .pdf, got {path}")
+    _require_column(runs, "y", y)
+    _require_column(runs, "x", x)
+    import matplotlib
+    from matplotlib.figure import Figure  # slow to import
+    from matplotlib.ticker import EngFormatter, MaxNLocator
+
+    groups = [g for g in group(runs) if curve(g, x, y).seeds]
+    log_y = y.startswith(RATIOS) and all((seed[1] > 0).all() for g in groups for seed in curve(g, x, y).seeds)
+    if not groups:
+        raise ConfigError(f"y: expected a column that some run has together with {x}, got {y}; choose another --x")
+    tasks = list(dict.fromkeys(g.task for g in groups))
+    columns = min(len(tasks), 3)
+    lines = -(-len(tasks) // columns)
+    figure = Figure(figsize=(max(5.2 * columns, 6.5), 4.2 * lines + 0.5), dpi=130, layout="constrained")
+    panels = list(figure.subplots(lines, columns, squeeze=False).flat)
+    for axes, task in zip(panels, tasks, strict=False):
+        of_task = [g for g in groups if g.task == task]
+        log = is_far(x, [seed[0][-1] for g in of_task for seed in curve(g, x, y).seeds])
+        for i, g in enumerate(of_task):
+            c = curve(g, x, y, log, log_y)
+            style = {"color": _COLOURS[i % len(_COLOURS)], "linestyle": ("-", "--", ":")[i // len(_COLOURS) % 3]}
+            if len(c.seeds) > 1:
+                for seed in c.seeds:
+                    axes.plot(*seed, **style, linewidth=0.7, alpha=0.4)
+                axes.fill_between(c.x, c.low, c.high, color=style["color"], alpha=0.15, linewidth=0)
+            name = f"{g.label} ({counted(len(c.seeds), 'seed')})" if len(c.seeds) > 1 else g.label
+            marker = "o" if len(c.seeds) == 1 and len(c.x) <= _DOTS else ""
+            axes.plot(c.x, c.mean, **style, linewidth=2, marker=marker, markersize=3.5, label=name)
+        axes.set_title(task, fontsize=11, parse_math=False)
+        axes.set_xlabel(_NAMES.get(x, x))
+        axes.set_ylabel(_NAMES.get(y, y), parse_math=False)
+        axes.grid(True, color="#dddddd", linewidth=0.7)
+        axes.set_axisbelow(True)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        if x == "iteration":
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        if log_y:
+            _logarithmic(axes)
+        if log:
+            axes.set_xscale("log")
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        legend = axes.legend(
+            frameon=False, fontsize=8, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.14), handlelength=3
+        )
+        for text in legend.get_texts():
+            text.set_parse_math(False)
+    for axes in panels[len(tasks) :]:
+        axes.set_axis_off()
+    picture = io.BytesIO()
+    # The same runs give the same bytes: no date, and no random names inside of an SVG.
+    nothing = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
+    with matplotlib.rc_context({"svg.hashsalt": "metrpo"}):
+        figure.savefig(picture, format=kind, metadata=nothing)
+    atomic_write(path, picture.getvalue())
+    return path
+
+
+def _logarithmic(axes: Axes) -> None:
+    """Makes y logarithmic, with plain numbers at 1, 2 and 5."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def _require_column(runs: Sequence[SeenRun], option: str, name: str) -> None:
+    columns = dict.fromkeys(n for run in runs for n in (run.rows[0] if run.rows else ()))
+    if not any(np.isfinite(run.column(name)).any() for run in runs):
+        have = [n for n in columns if any(np.isfinite(run.column(n)).any() for run in runs)]
+        more = ", or one of diagnostics.csv" if any(run.details for run in runs) else ""
+        said = "an empty one (deterministic runs keep no clock)" if name in columns else repr(name)
+        raise ConfigError(
+            f"{option}: expected a column with numbers ({', '.join(have) or 'there is none'}{more}), got {said}"
+        )

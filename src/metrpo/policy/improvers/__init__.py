@@ -1,0 +1,1 @@
+"""The ways to improve a policy in the ensemble."""

@@ -1,0 +1,75 @@
+"""Proximal policy optimization: several epochs of minibatches on the clipped surrogate (Schulman et al. 2017)."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from metrpo.config import GradientConfig, PPOConfig
+from metrpo.devices import across, share_of
+from metrpo.policy import gaussian
+from metrpo.policy.gaussian import Policy
+from metrpo.policy.improvers.adam import ascend
+from metrpo.policy.improvers.batch import Batch, ImproveInfo, by_gradient, mean_kl
+from metrpo.types import Array
+
+
+def clipped_surrogate(
+    policy: Policy, batch: Batch, old_log_probability: Array, clip: float, penalty: float = 0.0
+) -> Array:
+    """sum of min(ratio A, clip(ratio, 1 - clip, 1 + clip) A) over the steps of `batch` (their equation 7).
+
+    Less `penalty` times the squared excess of mean actions beyond 0.9.
+    """
+    means = gaussian.mean(policy, batch.states)
+    log_probability = gaussian.log_probability(means, policy.log_std, batch.actions)
+    cost = penalty * jnp.sum(jnp.square(gaussian.excess(means)), axis=-1) if penalty else 0.0
+    ratio = jnp.exp(log_probability - old_log_probability)
+    clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
+    return jnp.sum(batch.mask * (jnp.minimum(ratio * batch.advantages, clipped * batch.advantages) - cost))
+
+
+def improve(
+    policy: Policy,
+    moments: Any,
+    batch: Batch,
+    ppo: PPOConfig,
+    config: GradientConfig,
+    key: Array,
+    axis: str | None = None,
+    penalty: float = 0.0,
+) -> tuple[Policy, Any, ImproveInfo]:
+    """`ppo.epochs` passes over `batch`, shuffled anew in each by `key`; `moments` are Adam's.
+
+    Steps that `ppo.minibatches` does not divide are left out of a pass, others each time. With `axis`, `batch` is this
+    device's share of the batch (see `metrpo.devices`).
+    """
+    old_log_probability = gaussian.log_probability(gaussian.mean(policy, batch.states), policy.log_std, batch.actions)
+    steps = batch.mask.shape[0]
+    minibatches = min(ppo.minibatches, steps)
+    size = steps // minibatches
+
+    def step(carry: tuple[Policy, Any, Array], index: Array) -> tuple[tuple[Policy, Any, Array], None]:
+        policy, moments, sound = carry
+        rows = jax.tree.map(partial(jnp.take, indices=index, axis=0), (batch, old_log_probability))
+        count = jnp.maximum(across(jnp.sum(rows[0].mask), axis), 1.0)
+        gradient = across(jax.grad(clipped_surrogate)(policy, *rows, ppo.clip, penalty), axis)
+        gradient = jax.tree.map(lambda g: g / count, gradient)
+        policy, moments, made = ascend(policy, moments, gradient, config)
+        return (policy, moments, sound & made), None
+
+    def epoch(carry: tuple[Policy, Any, Array], key: Array) -> tuple[tuple[Policy, Any, Array], None]:
+        order = jax.random.permutation(key, steps)[: minibatches * size].reshape(minibatches, size)
+        return jax.lax.scan(step, carry, order)[0], None
+
+    keys = jax.random.split(share_of(key, axis), ppo.epochs)
+    (new, moments, sound), _ = jax.lax.scan(epoch, (policy, moments, jnp.bool_(True)), keys)
+    count = jnp.maximum(across(jnp.sum(batch.mask), axis), 1.0)
+    gain, start = (
+        across(clipped_surrogate(p, batch, old_log_probability, ppo.clip, penalty), axis) / count for p in (new, policy)
+    )
+    kl = mean_kl(policy, new, batch.states, batch.mask, axis)
+    return new, moments, by_gradient(kl, gain - start, sound)

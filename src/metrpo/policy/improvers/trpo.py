@@ -1,0 +1,134 @@
+"""Trust-region policy optimization (Schulman et al. 2015): natural gradient by conjugate gradients, line search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from metrpo.config import TRPOConfig
+from metrpo.devices import across
+from metrpo.policy import gaussian
+from metrpo.policy.gaussian import Policy
+from metrpo.policy.improvers.batch import Batch, ImproveInfo
+from metrpo.policy.improvers.linearised import Linearised, chunked, forward, gauss_newton, linearise, pull_back
+from metrpo.types import Array
+
+
+def improve(
+    policy: Policy, batch: Batch, config: TRPOConfig, axis: str | None = None, penalty: float = 0.0
+) -> tuple[Policy, ImproveInfo]:
+    """One TRPO update on `batch`; the policy stays as it is when no step of the line search improves within max_kl.
+
+    The surrogate loses `penalty` times the squared excess of mean actions beyond 0.9: clipped actions have no
+    gradient that could bring them back. With `axis`, `batch` is this device's share of the batch (see
+    `metrpo.devices`).
+    """
+    states, actions, advantages, mask = (chunked(x) for x in batch)
+    count = jnp.maximum(across(jnp.sum(mask), axis), 1.0)
+    weights = mask * advantages / count
+    old_log_std = policy.log_std[:, None]
+    at = linearise(policy.layers, states)
+
+    def cost(means: Array, mask: Array) -> Array:
+        return penalty / count * jnp.sum(mask * jnp.square(gaussian.excess(means))) if penalty else jnp.float32(0)
+
+    def surrogate_and_kl(new: Policy) -> tuple[Array, Array]:
+        log_std = new.log_std[:, None]
+
+        def add(total: tuple[Array, Array], chunk: tuple[Array, ...]) -> tuple[tuple[Array, Array], None]:
+            states, actions, old_means, weights, mask = chunk
+            means = forward(new.layers, states)[-1]
+            log_ratio = gaussian.log_probability(means, log_std, actions, 0) - gaussian.log_probability(
+                old_means, old_log_std, actions, 0
+            )
+            divergence = gaussian.kl(old_means, old_log_std, means, log_std, 0)
+            gain = jnp.sum(weights * jnp.exp(log_ratio)) - cost(means, mask)
+            return (total[0] + gain, total[1] + jnp.sum(mask * divergence)), None
+
+        zero = (jnp.float32(0), jnp.float32(0))
+        surrogate, divergence = across(jax.lax.scan(add, zero, (states, actions, at.means, weights, mask))[0], axis)
+        return surrogate, divergence / count
+
+    # The surrogate's gradient at the old policy, where every ratio is 1.
+    z = (actions - at.means) * jnp.exp(-old_log_std)
+    rising = weights * z * jnp.exp(-old_log_std)
+    if penalty:
+        rising = rising - 2 * penalty / count * mask * gaussian.excess(at.means)
+    slope = Policy(pull_back(at, rising), jnp.sum(weights * (jnp.square(z) - 1.0), axis=(0, 2)))
+    flat, unravel = ravel_pytree(policy)
+    gradient = ravel_pytree(across(slope, axis))[0]
+    if (every := config.fisher_every) > 1:
+        at_sample, sampled = linearise(policy.layers, chunked(batch.states[::every])), chunked(batch.mask[::every])
+    else:
+        at_sample, sampled = at, mask
+    product = fisher_product(policy, at_sample, sampled, config.damping, axis)
+    direction, residual = conjugate_gradient(
+        lambda v: ravel_pytree(product(unravel(v)))[0], gradient, config.cg_iterations
+    )
+    # F x = g - residual, so x'Fx needs no further product.
+    curvature = jnp.dot(direction, gradient - residual)
+    step = direction * jnp.sqrt(2 * config.max_kl / jnp.maximum(curvature, 1e-12))
+    start = across(jnp.sum(weights) - cost(at.means, mask), axis)
+
+    def attempt(i: Array) -> tuple[Array, Array, Array]:
+        candidate = flat + config.backtrack_ratio**i * step
+        surrogate, divergence = surrogate_and_kl(unravel(candidate))
+        # Comparisons with NaN are false: a step into NaN is never accepted.
+        return (surrogate > start) & (surrogate < jnp.inf) & (divergence <= config.max_kl), surrogate, divergence
+
+    def searching(carry: tuple[Array, tuple[Array, Array, Array]]) -> Array:
+        return ~carry[1][0] & (carry[0] < config.max_backtracks - 1)
+
+    def search(carry: tuple[Array, Any]) -> tuple[Array, tuple[Array, Array, Array]]:
+        return carry[0] + 1, attempt(carry[0] + 1)
+
+    zero = jnp.int32(0)
+    tries, (accepted, surrogate, divergence) = jax.lax.while_loop(searching, search, (zero, attempt(zero)))
+    new = jnp.where(accepted, flat + config.backtrack_ratio**tries * step, flat)
+    norm = jnp.linalg.norm(gradient)
+    return unravel(new), ImproveInfo(
+        kl=jnp.where(accepted, divergence, 0.0),
+        improvement=jnp.where(accepted, surrogate - start, 0.0),
+        accepted=accepted,
+        backtracks=tries,
+        cg_residual=jnp.linalg.norm(residual) / jnp.maximum(norm, 1e-30),
+    )
+
+
+def fisher_product(
+    policy: Policy, at: Linearised, mask: Array, damping: float, axis: str | None = None
+) -> Callable[[Policy], Policy]:
+    """v -> (F + damping I) v, F the policy's Fisher matrix averaged over the steps where `mask` [C, 1, CHUNK] is 1.
+
+    The Gaussian's Fisher matrix is J' diag(1 / std^2) J for the mean network and 2 I for log_std (Gauss-Newton), which
+    is the Hessian of KL(old || new) at new = old.
+    """
+    count = jnp.maximum(across(jnp.sum(mask), axis), 1.0)
+    weights = mask * jnp.exp(-2 * policy.log_std)[:, None] / count
+
+    def product(v: Policy) -> Policy:
+        curvature = Policy(across(gauss_newton(at, weights, v.layers), axis), 2.0 * v.log_std)
+        return jax.tree.map(lambda c, x: c + damping * x, curvature, v)
+
+    return product
+
+
+def conjugate_gradient(product: Callable[[Array], Array], target: Array, iterations: int) -> tuple[Array, Array]:
+    """Solves product(x) = target from x = 0: (x, residual target - product(x))."""
+
+    def step(_: Array, carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+        x, residual, direction, square = carry
+        image = product(direction)
+        # Once solved, direction and residual are 0: the guards keep 0 / 0 out.
+        alpha = square / jnp.maximum(jnp.dot(direction, image), 1e-30)
+        x, residual = x + alpha * direction, residual - alpha * image
+        next_square = jnp.dot(residual, residual)
+        return x, residual, residual + next_square / jnp.maximum(square, 1e-30) * direction, next_square
+
+    start = (jnp.zeros_like(target), target, target, jnp.dot(target, target))
+    x, residual, _, _ = jax.lax.fori_loop(0, iterations, step, start)
+    return x, residual

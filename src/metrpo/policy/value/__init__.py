@@ -1,0 +1,1 @@
+"""What values a state, so that advantages can be measured against it."""

@@ -1,0 +1,164 @@
+"""A search over settings: which task, which settings over what, how many trials, and what a trial is worth."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import tomllib
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, cast
+
+from metrpo.config import Config, Preset, System, flatten
+from metrpo.errors import ConfigError
+from metrpo.launch.grid import flat, seeds_of
+from metrpo.launch.run_spec import RunSpec
+from metrpo.presets import override, preset
+from metrpo.run.metrics import Row
+from metrpo.tune.space import Span, span
+from metrpo.world.registry import get_task
+
+if TYPE_CHECKING:
+    pass
+
+Pruner = Literal["median", "halving", "none"]
+LAST = 3
+"""Evaluations, one after each iteration, whose mean counts: one alone is noise."""
+OBJECTIVE = f"mean over the seeds of the mean return_real of the last {LAST} iterations"
+_NOT_SEARCHED = ("task", "preset", "system", "seed", "iterations", "real_steps")
+"""What all trials share: they have options of their own."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """What is searched.
+
+    Raises `ConfigError` or `TaskError` for what cannot be run, before anything is: an unknown setting or task, an
+    impossible value at either end of a range or among the choices.
+    """
+
+    task: str
+    space: Mapping[str, Span]
+    """Dotted setting -> what it is searched over."""
+    system: System = "me-trpo"
+    preset: Preset = "fast"
+    seeds: tuple[int, ...] = (0, 1)
+    """Of every trial; it is worth their mean."""
+    iterations: int | None = None
+    real_steps: int | None = None
+    """The budget of every run, one of the two; default: the preset's iterations."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Other settings that are not the preset's."""
+    trials: int = 20
+    pruner: Pruner = "median"
+    sampler_seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, least, value in (("trials", 1, self.trials), ("sampler_seed", 0, self.sampler_seed)):
+            if type(value) is not int or value < least:
+                raise ConfigError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+        if self.pruner not in typing.get_args(Pruner):
+            raise ConfigError(f"pruner: expected one of {', '.join(typing.get_args(Pruner))}, got {self.pruner!r}")
+        if not self.space or not self.seeds:
+            raise ConfigError("tune: expected at least one setting to search and one seed; give --search NAME=A..B")
+        if self.iterations is not None and self.real_steps is not None:
+            raise ConfigError("tune: expected iterations or real_steps, got both; leave one out")
+        if self.real_steps is not None and (type(self.real_steps) is not int or self.real_steps < 1):
+            raise ConfigError(f"real_steps: expected a whole number of at least 1, got {self.real_steps!r}")
+        for name in (*self.space, *self.settings):
+            if name in _NOT_SEARCHED or (name in self.space and name in self.settings):
+                twice = (
+                    "is to be fixed and searched" if name in self.space and name in self.settings else "has an option"
+                )
+                raise ConfigError(f"tune: expected settings of a run, each once, got {name}, which {twice}")
+        if "collect.steps" in self.space and self.pruner != "none":
+            raise ConfigError(
+                "collect.steps: expected iterations of one length, for pruning compares trials after as many of them, "
+                "got it among what is searched; add --pruner none, and --real-steps, so that all cost the same"
+            )
+        object.__setattr__(self, "task", get_task(self.task).name)
+        for name, over in self.space.items():
+            for value in over.outermost:
+                override(self.base, {name: value})
+        for end in (0, -1):
+            override(self.base, {name: over.outermost[end] for name, over in self.space.items()})
+
+    @property
+    def base(self) -> Config:
+        """The settings that every run starts from."""
+        return override(preset(self.task, self.preset, self.system), dict(self._fixed))
+
+    @property
+    def _fixed(self) -> tuple[tuple[str, Any], ...]:
+        budget = {"iterations": self.iterations, "real_steps": self.real_steps}
+        given = {name: value for name, value in budget.items() if value is not None} | dict(self.settings)
+        return tuple((name, tuple(v) if isinstance(v, list) else v) for name, v in given.items())
+
+    @property
+    def usual(self) -> dict[str, Any] | None:
+        """The searched settings as the preset has them; None when one is not among what is searched."""
+        values = flatten(self.base)
+        found = {name: values[name] for name in self.space}
+        return found if all(self.space[name].holds(value) for name, value in found.items()) else None
+
+    def runs(self, number: int, values: Mapping[str, Any]) -> list[RunSpec]:
+        """The runs of trial `number`, one for each seed."""
+        overrides = (*self._fixed, *values.items())
+        folder = f"trial-{number:03d}"
+        return [RunSpec(self.task, self.system, seed, overrides, self.preset, folder) for seed in self.seeds]
+
+    @property
+    def steps(self) -> int:
+        """About how many iterations a run has."""
+        base = self.base
+        return base.iterations if base.real_steps is None else math.ceil(base.real_steps / base.collect.steps)
+
+    def is_spent(self, rows: Sequence[Row]) -> bool:
+        """Whether a run with these rows of metrics has used up its budget."""
+        if not rows:
+            return False
+        if self.real_steps is not None:
+            return int(rows[-1]["real_steps"] or 0) >= self.real_steps
+        return int(rows[-1]["iteration"] or 0) >= (self.iterations or self.base.iterations)
+
+    def record(self) -> dict[str, Any]:
+        """What makes two searches the same, as JSON; more trials make no other one."""
+        found = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "trials"}
+        settings = {name: list(v) if isinstance(v, tuple) else v for name, v in self.settings.items()}
+        return found | {
+            "space": {name: str(over) for name, over in self.space.items()},
+            "seeds": list(self.seeds),
+            "settings": settings,
+        }
+
+
+def worth(returns: Sequence[Sequence[Row]], iterations: int | None = None) -> list[float]:
+    """What the seeds' runs earn after so many iterations (None: all of each): `OBJECTIVE` is the mean of these."""
+    found = []
+    for rows in returns:
+        last = [row.get("return_real") for row in rows[:iterations][-LAST:]]
+        found.append(math.fsum(math.nan if r is None else r for r in last) / len(last))
+    return found
+
+
+def from_file(path: Path) -> Search:
+    """The search in a TOML file: task, trials, seeds ..., and tables [search] and [set] of settings.
+
+    Raises `ConfigError` when it cannot be read or says something else, or what `Search` raises.
+    """
+    names = [f.name for f in dataclasses.fields(Search) if f.name not in ("space", "settings")]
+    try:
+        spec = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"{path}: expected a TOML file with task and [search], got {error}") from error
+    searched, settings = spec.pop("search", {}), spec.pop("set", {})
+    if unknown := [key for key in spec if key not in names]:
+        raise ConfigError(f"{path}: expected {', '.join(names)}, [search] and [set], got {unknown[0]}")
+    if not isinstance(spec.get("task"), str) or not isinstance(searched, dict) or not isinstance(settings, dict):
+        raise ConfigError(f'{path}: expected a task such as "Swimmer", and tables [search] and [set]')
+    if "seeds" in spec:
+        spec["seeds"] = seeds_of(",".join(map(str, s)) if isinstance(s := spec["seeds"], list) else str(s))
+    space = {name: span(name, values) for name, values in flat(searched).items()}
+    return Search(**cast(Any, {**spec, "space": space, "settings": flat(settings)}))

@@ -1,0 +1,1 @@
+"""Tasks whose reward and termination are known formulas."""
