@@ -190,7 +190,7 @@ def test_what_is_asked_of_ray(on, monkeypatch, tmp_path):
 
 
 def test_what_is_asked_of_machines_that_share_no_disk(on, monkeypatch, tmp_path):
-    monkeypatch.setattr(driver.sent, "start_store", lambda ray, out: f"the store of {out}")
+    monkeypatch.setattr(driver.sync, "start_store", lambda ray, out: f"the store of {out}")
     ray = FakeRay([Ended(0, (ROW,), 7.0)] * 4)
     failed, _ = on(ray, MEANS)
     assert failed == []

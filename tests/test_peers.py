@@ -19,7 +19,7 @@ BENCH = Path(peers.__file__).parent
 ANSWERS = f"""
 import os, sys
 sys.path.insert(0, {str(BENCH)!r})
-from worker_loop import serve
+from peer_loop import serve
 
 calls = []
 
@@ -224,7 +224,7 @@ def test_the_scripts_offer_the_work_that_we_name(peer):
     assert len(set(names)) == len(names)
 
 
-@pytest.mark.parametrize("script", sorted(BENCH.glob("worker_*.py")), ids=lambda path: path.name)
+@pytest.mark.parametrize("script", sorted(BENCH.glob("peer_*.py")), ids=lambda path: path.name)
 def test_the_scripts_run_where_metrpo_is_not_installed(script):
     tree = ast.parse(script.read_text())
     modules = [n.module for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]

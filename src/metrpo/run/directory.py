@@ -48,7 +48,7 @@ from metrpo.run.metrics import (
     to_csv,
     without_clocks,
 )
-from metrpo.run.policy_file import Interface, Weights, has_policy, save_policy
+from metrpo.run.policy_file import Interface, Weights, save_policy
 from metrpo.safe_load import text_of
 from metrpo.world.registry import get_task
 
@@ -134,7 +134,7 @@ class RunDirectory:
         self.episodes.start(after=meta.get("episodes", 0))
         self._taken = [self.episodes.taken]
         self._write_config()
-        self._publish(state, missing_only=self._is_published())
+        self._publish(state)
         return state
 
     def begin(self, state: Saved) -> None:
@@ -220,34 +220,20 @@ class RunDirectory:
         if not _holds(file, text):
             atomic_write(file, text)
 
-    def _is_published(self) -> bool:
-        """Whether all that derives from these rows has been written: metrics.csv is the last file to be."""
-        return bool(self.rows) and _holds(self.path / "metrics.csv", to_csv([overview(row) for row in self.rows]))
-
-    def _publish(self, state: Saved, missing_only: bool = False) -> None:
+    def _publish(self, state: Saved) -> None:
+        # All of it at every start, too: nothing says whether a picture or an event file is damaged.
         for old in self._checkpoints()[:-_KEPT]:
             with contextlib.suppress(OSError):  # costs room only
                 old.unlink()
-        writers: dict[str, Callable[[], None]] = {"policy.npz": lambda: self._write_policy(state)}
-        if self.rows:
-            writers |= {
-                "curve.png": lambda: self._derive("learning curve", self._draw_curve),
-                "events/events.*": lambda: self._derive("TensorBoard events", self._write_events),
-                "diagnostics.csv": self._write_details,
-                # Last: a run counts as finished, and is not begun again, by the rows in this file.
-                "metrics.csv": lambda: atomic_write(
-                    self.path / "metrics.csv", to_csv([overview(row) for row in self.rows])
-                ),
-            }
-        for name, write in writers.items():
-            if not (missing_only and self._has(name)):
-                write()
-
-    def _has(self, name: str) -> bool:
-        """Whether there is such a file, sound and no older than the checkpoint that it derives from."""
-        checkpoint = self._checkpoints()[-1].stat().st_mtime_ns
-        sound = name != "policy.npz" or has_policy(self.path)
-        return sound and any(path.stat().st_mtime_ns >= checkpoint for path in self.path.glob(name))
+        self._write_policy(state)
+        if not self.rows:
+            return
+        self._derive("learning curve", self._draw_curve)
+        self._derive("TensorBoard events", self._write_events)
+        if all(rows := [details(row) for row in self.rows]):
+            atomic_write(self.path / "diagnostics.csv", to_csv(rows))
+        # Last: a run counts as finished, and is not begun again, by the rows in this file.
+        atomic_write(self.path / "metrics.csv", to_csv([overview(row) for row in self.rows]))
 
     def _write_policy(self, state: Saved) -> None:
         result = self.rows[-1].get("return_real") if self.rows else None
@@ -259,10 +245,6 @@ class RunDirectory:
     def _draw_curve(self) -> None:
         title = f"{self.config.task}, {self.config.system}, {self.config.preset}, seed {self.config.seed}"
         draw_curve(self.rows, self.path / "curve.png", title, yardstick_record.kept(self.path))
-
-    def _write_details(self) -> None:
-        if all(rows := [details(row) for row in self.rows]):
-            atomic_write(self.path / "diagnostics.csv", to_csv(rows))
 
     def _write_events(self) -> None:
         if self._events is None or not self._events.path.exists():

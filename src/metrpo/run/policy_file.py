@@ -159,17 +159,6 @@ def save_policy(
     atomic_write(directory / "policy.json", json.dumps(beside, indent=2) + "\n")
 
 
-def has_policy(directory: Path) -> bool:
-    """Whether both files of a policy are there, sound, of this format and of one another."""
-    try:
-        load_policy(directory)
-        about = json.loads((directory / "policy.json").read_text())
-        digest = hashlib.sha256((directory / FILE).read_bytes()).hexdigest()
-        return bool(about["format"] == FORMAT and about["sha256"] == digest)
-    except (RunDirectoryError, OSError, ValueError, KeyError, TypeError):
-        return False
-
-
 def with_interface(info: PolicyInfo, interface: Interface | None) -> PolicyInfo:
     """The info with what the environment shows and takes; as it is where that is unknown or of other sizes."""
     if interface is None:

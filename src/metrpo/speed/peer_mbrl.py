@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from mbrl.models import BasicEnsemble, GaussianMLP, ModelEnv, OneDTransitionRewardModel
 from omegaconf import OmegaConf
-from worker_data import (
+from peer_data import (
     ACTION,
     FIT_STEPS,
     HIDDEN,
@@ -23,7 +23,7 @@ from worker_data import (
     reward,
     starts,
 )
-from worker_loop import Repetition, serve, timed
+from peer_loop import Repetition, serve, timed
 
 
 def _settings(name: str) -> dict[str, Any]:

@@ -10,11 +10,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
+from peer_data import ACTION, HORIZON, ROLLOUTS, STATE
+from peer_loop import Repetition, serve, timed
 from sb3_contrib import TRPO
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.vec_env import DummyVecEnv
-from worker_data import ACTION, HORIZON, ROLLOUTS, STATE
-from worker_loop import Repetition, serve, timed
 
 VALUE_UPDATES = 10
 """The library's default."""

@@ -8,8 +8,7 @@ from itertools import pairwise
 from typing import Any
 
 import torch
-from torch.nn.utils import parameters_to_vector, vector_to_parameters
-from worker_data import (
+from peer_data import (
     ACTION,
     FIT_STEPS,
     HIDDEN,
@@ -24,7 +23,8 @@ from worker_data import (
     reward,
     starts,
 )
-from worker_loop import Repetition, serve, timed
+from peer_loop import Repetition, serve, timed
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 
 MAX_KL, DAMPING, CG_ITERATIONS, RATIO, TRIES = 0.01, 1e-5, 10, 0.8, 15
 

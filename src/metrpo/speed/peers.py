@@ -49,9 +49,9 @@ WORK = {
 PEERS = tuple(WORK)
 
 SCRIPTS = {
-    "mbrl-lib": Path(__file__).with_name("worker_mbrl.py"),
-    "sb3-contrib": Path(__file__).with_name("worker_sb3.py"),
-    "pytorch": Path(__file__).with_name("worker_torch.py"),
+    "mbrl-lib": Path(__file__).with_name("peer_mbrl.py"),
+    "sb3-contrib": Path(__file__).with_name("peer_sb3.py"),
+    "pytorch": Path(__file__).with_name("peer_torch.py"),
 }
 
 _IMPORTS = "import torch, sb3_contrib, mbrl.models"
