@@ -56,13 +56,13 @@ for module in (
 
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "results" / "mutation"
-LEARNED = "tests/test_environments.py::test_the_dataset_holds_reward_and_end_where_they_are_learned"
+LEARNED = "tests/world/test_resolve.py::test_the_dataset_holds_reward_and_end_where_they_are_learned"
 MODULES = {
-    "trpo": ("src/metrpo/policy/improvers/trpo.py", ["tests/test_trpo.py"]),
-    "advantage": ("src/metrpo/policy/advantage.py", ["tests/test_advantage.py"]),
-    "validate": ("src/metrpo/policy/stopping.py", ["tests/test_validate.py"]),
-    "dataset": ("src/metrpo/world/dataset.py", ["tests/test_dataset.py", LEARNED]),
-    "checkpoint": ("src/metrpo/run/checkpoint.py", ["tests/test_checkpoint.py"]),
+    "trpo": ("src/metrpo/policy/improvers/trpo.py", ["tests/policy/improvers/test_trpo.py"]),
+    "advantage": ("src/metrpo/policy/advantage.py", ["tests/policy/test_advantage.py"]),
+    "validate": ("src/metrpo/policy/stopping.py", ["tests/policy/test_stopping.py"]),
+    "dataset": ("src/metrpo/world/dataset.py", ["tests/world/test_dataset.py", LEARNED]),
+    "checkpoint": ("src/metrpo/run/checkpoint.py", ["tests/run/test_checkpoint.py"]),
 }
 PATIENCE = 600
 """Seconds of silence after which a mutant counts as hanging without work."""

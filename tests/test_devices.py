@@ -15,6 +15,7 @@ from helpers import random_ensemble
 from metrpo import devices
 from metrpo.model.model_parallel import can_share
 from metrpo.run import machine
+from places import SUPPORT
 
 PREAMBLE = """
 import jax, numpy as np
@@ -44,7 +45,8 @@ np.savez(OUT, *jax.tree.leaves(fitted), *jax.tree.leaves(info))
 
 IMPROVE = """
 from metrpo.config import TRPOConfig
-from metrpo.policy import advantage, trpo
+from metrpo.policy import advantage
+from metrpo.policy.improvers import trpo
 from metrpo.policy.improvers.batch import Batch
 from metrpo.types import Trajectories
 rng = np.random.default_rng(0)
@@ -166,7 +168,7 @@ np.savez(OUT, out)
 def results(code: str, count: int, out: Path, *flags: str) -> list:
     """What `code` saves to OUT in a process with `count` CPU devices."""
     flags = " ".join([f"--xla_force_host_platform_device_count={count}", *flags])
-    tests = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    tests = os.pathsep.join([str(SUPPORT), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": tests}
     program = PREAMBLE + f"assert len(jax.devices()) == {count}\nOUT = {str(out)!r}\n" + code
     ran = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)

@@ -19,6 +19,7 @@ from metrpo import read_metrics
 from metrpo.errors import RunDirectoryError
 from metrpo.launch.grid import Grid, values_of
 from metrpo.launch.status import words
+from places import SUPPORT
 
 pytestmark = [
     pytest.mark.slow,
@@ -26,7 +27,7 @@ pytestmark = [
     pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray: make ray, or pip install 'metrpo[ray]'"),
 ]
 
-CART = f"{Path(__file__).parents[1] / 'carts.py'}:CART"
+CART = f"{SUPPORT / 'carts.py'}:CART"
 RUNS = 12
 FAILS = 3
 """Seed of the run that always does; the first three are under way at the same time."""
@@ -49,9 +50,9 @@ ENVIRONMENT = os.environ | {"MUJOCO_GL": "disabled"}
 SLOW = ENVIRONMENT | {"METRPO_TEST_STEP_SECONDS": "0.05"}
 ALONE = """
 import sys
-from metrpo import cli
+from metrpo.commands import main
 for line in sys.stdin:
-    assert cli.main(line.rstrip("\\n").split("\\t")) == 0
+    assert main.main(line.rstrip("\\n").split("\\t")) == 0
 """
 
 

@@ -3,15 +3,14 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from metrpo import read_metrics
+from places import SUPPORT
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 
-TESTS = Path(__file__).parents[1]
 RUNS = 20
 TINY = {
     "deterministic": True,
@@ -31,7 +30,7 @@ DERIVED = ("metrics.csv", "policy.npz", "config.json", "checkpoints/iteration-00
 
 
 def environment(cache):
-    path = os.pathsep.join([str(TESTS), *sys.path])
+    path = os.pathsep.join([str(SUPPORT), *sys.path])
     return os.environ | {"PYTHONPATH": path, "XDG_CACHE_HOME": str(cache), "MUJOCO_GL": "disabled"}
 
 

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from places import SUPPORT
+
 ITERATIONS, SETTLED = 200, 20
 LIMITS = {"collect.max_train": 400, "collect.max_validation": 200}
 
@@ -40,7 +42,7 @@ print(json.dumps([Memory.resident, int(state.dataset.train.size), int(state.data
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read as Linux gives it")
 @pytest.mark.timeout(900)
 def test_two_hundred_iterations_hold_no_more_memory_than_twenty(tmp_path):
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(SUPPORT), *sys.path])}
     done = subprocess.run(
         [sys.executable, "-c", RUN, str(tmp_path / "run")], capture_output=True, text=True, env=environment
     )

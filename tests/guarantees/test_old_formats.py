@@ -26,8 +26,9 @@ from metrpo.run.files import DamagedFile, read_arrays, write_arrays
 from metrpo.run.metrics import read_metrics
 from metrpo.run.policy_file import load_policy
 from metrpo.types import Episode
+from places import GUARANTEES
 
-OLD = Path(__file__).parent / "format-1"
+OLD = GUARANTEES / "format-1"
 AS_IT_WAS = {
     "advantage.baseline": "linear",
     "advantage.gae_lambda": 1.0,

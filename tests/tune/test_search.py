@@ -32,6 +32,7 @@ from metrpo.tune.search import Search, from_file, worth
 from metrpo.tune.space import Choices, Range, span_of
 from metrpo.tune.study import FILE
 from metrpo.tune.trials import tune
+from places import ROOT, SUPPORT
 from tiny_run import SMALL
 
 SPACE = {"trpo.max_kl": Range(0.001, 1.0, log=True), "ensemble.members": Choices((1, 3, 5))}
@@ -556,18 +557,18 @@ def test_a_run_that_survived_its_tune_is_watched_stopped_and_taken_over(tmp_path
 @pytest.mark.timeout(600)  # seconds on a free core; a machine that does other work needs longer
 @pytest.mark.slow
 def test_killed_together_with_its_run_it_goes_on_from_the_checkpoint(tmp_path):
-    out, tests = tmp_path / "out", Path(__file__).parent
+    out = tmp_path / "out"
     fixed = {name: value for name, value in SMALL.items() if name != "iterations"}
     file = tmp_path / "search.toml"
     file.write_text(
-        f'task = "{tests / "probe.py"}:PROBE"\ntrials = 1\nseeds = 0\niterations = 3\n[search]\n'
+        f'task = "{SUPPORT / "probe.py"}:PROBE"\ntrials = 1\nseeds = 0\niterations = 3\n[search]\n'
         'trpo.max_kl = "log 0.001..0.1"\n[set]\n'
         + "".join(f"{name} = {json.dumps(value)}\n" for name, value in fixed.items())
     )
 
     def start():
         words = [sys.executable, "-m", "metrpo", "tune", str(file), "--jobs", "1", "--out", str(out), "--json"]
-        return subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": str(tests)})
+        return subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": str(SUPPORT)})
 
     first = start()
     while not list(out.glob("*/trial-000/seed-0/metrics.csv")) and first.poll() is None:
@@ -602,15 +603,14 @@ def test_killed_together_with_its_run_it_goes_on_from_the_checkpoint(tmp_path):
 
 
 def test_the_committed_search_is_what_its_page_says(tmp_path):
-    root = Path(__file__).parents[1]
-    page = (root / "docs" / "tuning.md").read_text()
+    page = (ROOT / "docs" / "tuning.md").read_text()
     line = next(part for part in page.split("```") if "--out results/tune" in part).replace("\\\n", " ")
     asked = as_typed(options.parse(shlex.split(line)[1:]))
-    shutil.copy(root / "results" / "tune" / FILE, tmp_path)
+    shutil.copy(ROOT / "results" / "tune" / FILE, tmp_path)
     found = tune(asked, tmp_path, 1, silent, Fake())
     assert (len(found.records), sum(r.state == "pruned" for r in found.records)) == (8, 2)
     for r in found.records:
-        rows = [tuning.rows_of(run, root / "results" / "tune") for run in asked.runs(r.number, r.settings)]
+        rows = [tuning.rows_of(run, ROOT / "results" / "tune") for run in asked.runs(r.number, r.settings)]
         assert r.real_steps == sum(one[-1]["real_steps"] for one in rows)
         if r.state == "pruned":
             assert f"{r.value:.0f}" in page
@@ -620,6 +620,6 @@ def test_the_committed_search_is_what_its_page_says(tmp_path):
         assert re.search(rf"\| {r.number}\D* \| {r.value:.1f} \| {returns} \|", page)
     assert f"{64_000 - sum(r.real_steps for r in found.records):,} of 64,000" in page
     for trial in ("trial-003", "trial-000"):
-        again = sorted((root / "results" / "tune-again" / "Pendulum-v1" / trial).glob("seed-*/metrics.csv"))
+        again = sorted((ROOT / "results" / "tune-again" / "Pendulum-v1" / trial).glob("seed-*/metrics.csv"))
         each = worth([read_metrics(path) for path in again])
         assert f"{sum(each) / 3:.1f} ({', '.join(f'{value:.1f}' for value in each)})" in page

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import runpy
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ import pytest
 from metrpo.world import open_loop
 from metrpo.world.open_loop import OpenLoop
 from metrpo.world.registry import get_task
+from places import ROOT
 
 NAMES = ["Swimmer", "Snake", "Hopper", "HopperUpright", "HalfCheetah", "Ant", "Humanoid", "HumanoidStandup"]
 
@@ -51,7 +51,7 @@ def test_many_plans_are_rolled_out_in_parts(monkeypatch):
 
 @pytest.fixture
 def ceiling():
-    return runpy.run_path(str(Path(__file__).parents[1] / "benchmarks" / "ceiling.py"))
+    return runpy.run_path(str(ROOT / "benchmarks" / "ceiling.py"))
 
 
 def test_coloured_noise_has_its_spectrum_and_std_one(ceiling, monkeypatch):

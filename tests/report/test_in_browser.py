@@ -14,8 +14,8 @@ from browser import Browser, chromium
 from metrpo.config import EnsembleConfig
 from metrpo.report.page import page
 from metrpo.run.find import find
-from test_seeing_health import exploiting, healthy
-from test_seeing_page import CONFIG, ONE, RESULTS, a_run, details
+from places import RESULTS
+from seen_runs import CONFIG, ONE, a_run, details, exploiting, healthy
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason="no Chromium here (apt install chromium)")
 

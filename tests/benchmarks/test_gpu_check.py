@@ -14,8 +14,9 @@ import pytest
 
 import probe
 from metrpo import algorithm
+from places import ROOT
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+BENCHMARKS = ROOT / "benchmarks"
 
 
 @pytest.fixture

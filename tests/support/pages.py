@@ -7,7 +7,8 @@ import shlex
 from pathlib import Path
 from typing import NamedTuple
 
-ROOT = Path(__file__).resolve().parents[1]
+from places import ROOT
+
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 SHELL = ("", "sh", "bash", "console")
 PLACEHOLDERS = {"TASK": "Swimmer", "FIGURE": "all", "DIR": "runs/a", "FILE": "log.npz", "N": "0", "B": "0.1"}

@@ -151,8 +151,9 @@ ctypes.util.find_library = lambda name: None if absent(name) else find(name)
 from metrpo.commands.main import main
 for command in (["tasks"], ["doctor"], ["render", sys.argv[1], "--out", "v.gif"]):
     print("exit code", main(command), flush=True)
-from metrpo import cli
-cli._report(cli.Path(sys.argv[1]), video=True)  # what a finished run says
+from pathlib import Path
+from metrpo.commands import main
+main._report(Path(sys.argv[1]), video=True)  # what a finished run says
 """
 
 

@@ -7,7 +7,6 @@ import json
 import math
 import subprocess
 import sys
-from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -26,8 +25,9 @@ from metrpo.run.policy_file import load_policy
 from metrpo.training import train
 from metrpo.world import registry
 from metrpo.world.task import Task
+from places import ROOT
 
-ROBOT = Path(__file__).resolve().parents[1] / "examples" / "robot"
+ROBOT = ROOT / "examples" / "robot"
 SMALL = probe.BRIEF | {"collect.steps": 100, "collect.max_train": 400, "collect.max_validation": 200}
 
 

@@ -5,14 +5,13 @@ import json
 import math
 import random
 import re
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 
 from metrpo.checks.health import examine
 from metrpo.commands.main import main
-from metrpo.config import Config, EnsembleConfig, ImagineConfig, to_json
+from metrpo.config import ImagineConfig
 from metrpo.console.watch import standing
 from metrpo.errors import RunDirectoryError
 from metrpo.report import page as pages
@@ -20,75 +19,9 @@ from metrpo.report.charts import Line, bars, chart, number, real_frame
 from metrpo.report.page import page, record
 from metrpo.run.curve import draw_curve
 from metrpo.run.find import Found, SeenRun, find, group
-from metrpo.run.metrics import read_metrics, to_csv
-from test_seeing_health import healthy
-
-RESULTS = Path(__file__).resolve().parents[1] / "results"
-CONFIG = Config("Swimmer", iterations=12)
-ONE = dataclasses.replace(CONFIG, system="k-1", ensemble=EnsembleConfig(members=1))
-VOID = {"meta", "br", "img"}
-LOADING = {"src", "srcset", "poster", "data", "action", "background", "xlink:href", "formaction", "ping", "cite"}
-
-
-def details(count=12, dimensions=4):
-    """diagnostics.csv of the healthy run; after a whole episode, dimension 2 is worse than no change, and model 3 never
-    agrees."""
-    worse = lambda k, d: 1.7 if (k, d) == ("T", 2) else 0.1 * (d + 1)  # noqa: E731
-    return [
-        {"iteration": i, "real_steps": 3000 * i}
-        | {f"error_{k}_{d}": worse(k, d) for k in ("1", "5", "T") for d in range(dimensions)}
-        | {f"improved_{k}": 0.0 if k == 3 else 0.8 for k in range(5)}
-        for i in range(1, count + 1)
-    ]
-
-
-def a_run(folder, config=CONFIG, rows=None, diagnostics=None):
-    folder.mkdir(parents=True)
-    (folder / "config.json").write_text(to_json(config))
-    rows = healthy() if rows is None else rows
-    if rows:
-        (folder / "metrics.csv").write_text(to_csv(rows))
-    if diagnostics:
-        (folder / "diagnostics.csv").write_text(to_csv(diagnostics))
-    return folder
-
-
-class Page(HTMLParser):
-    """What a browser would make of it: elements, what they refer to, and text; wrong nesting is an error."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tags, self.references, self.links, self.open, self.text, self.styles = [], [], [], [], "", ""
-        self.feed(text)
-        self.close()
-        assert self.open == [], "every element is closed"
-
-    def handle_starttag(self, tag, attributes):
-        self.tags.append(tag)
-        for name, value in attributes:
-            assert not name.startswith("on"), "no script in an attribute"
-            if name in LOADING or (name == "href" and tag != "a"):
-                self.references.append(value)
-            if name == "href" and tag == "a":
-                self.links.append(value)
-            if name == "style":
-                self.styles += value
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_startendtag(self, tag, attributes):
-        self.handle_starttag(tag, attributes)
-        if tag not in VOID:
-            self.open.pop()
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if self.open and self.open[-1] == "style":
-            self.styles += data
-        else:
-            self.text += data
+from metrpo.run.metrics import read_metrics
+from places import RESULTS
+from seen_runs import CONFIG, ONE, Page, a_run, details, healthy, numbers_in
 
 
 def parsed(paths, folder=Path()):
@@ -350,10 +283,6 @@ def test_runs_are_found_once_and_groups_share_their_settings(tmp_path):
     }
     with pytest.raises(RunDirectoryError, match="got nothing"):
         find([tmp_path / "none"])
-
-
-def numbers_in(text, attribute):
-    return [float(v) for v in re.findall(rf'{attribute}="([-\d.]+)"', text)]
 
 
 def test_a_chart_puts_points_where_they_belong():

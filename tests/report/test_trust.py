@@ -1,6 +1,7 @@
 """The report's charts of how far models can be trusted: what is drawn is what was measured."""
 
 import dataclasses
+import math
 import re
 
 import numpy as np
@@ -12,8 +13,7 @@ from metrpo.report.page import page
 from metrpo.report.trust import trust_of
 from metrpo.run.find import find
 from metrpo.run.metrics import to_csv
-from test_seeing_health import NAN, healthy
-from test_seeing_page import CONFIG, ONE, Page, a_run, details, numbers_in
+from seen_runs import CONFIG, ONE, Page, a_run, details, healthy, numbers_in
 
 TITLES = ("Model error ", "Model error by dimension", "Disagreement", "Which models agree", "Outside the data")
 OLD = [{n: v for n, v in r.items() if not n.startswith(("error_", "disagreement_", "outside"))} for r in healthy()]
@@ -102,7 +102,7 @@ def test_the_heat_map_shows_which_dimension_and_after_how_many_steps(tmp_path):
 
 
 def test_what_was_not_measured_is_an_empty_cell(tmp_path):
-    rows = [r | {f"error_T_{d}": NAN for d in range(4)} for r in details()]
+    rows = [r | {f"error_T_{d}": math.nan for d in range(4)} for r in details()]
     made = picture(drawn(tmp_path / "a", diagnostics=rows), "Model error by state dimension")
     assert len(cells(made)) == 8
     assert made.count(">-<") == 4

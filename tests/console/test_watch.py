@@ -27,8 +27,7 @@ from metrpo.run.directory import RunDirectory
 from metrpo.run.find import find, group, read
 from metrpo.run.lock import claim
 from metrpo.types import Episode
-from test_seeing_health import healthy
-from test_seeing_page import a_run, details
+from seen_runs import a_run, details, healthy
 
 CONFIG = Config("Swimmer", iterations=20)
 TIMED = [r | {"wall_seconds": 2.0 * r["iteration"] ** 2} for r in healthy(10)]

@@ -7,69 +7,21 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
 
+from blank_run import CONFIG, DETERMINISTIC, a_row, a_state, train
 from metrpo import training
-from metrpo.config import Config, TRPOConfig, to_json
+from metrpo.config import TRPOConfig, to_json
 from metrpo.console.progress import Progress
 from metrpo.errors import RunDirectoryError
 from metrpo.run import directory as module
 from metrpo.run.directory import RunDirectory
 from metrpo.run.metrics import read_metrics
 from metrpo.run.policy_file import load_policy
-
-CONFIG = Config("Swimmer", iterations=5)
-DETERMINISTIC = dataclasses.replace(CONFIG, deterministic=True)
-
-
-class Weights(NamedTuple):
-    layers: tuple
-    log_std: Any
-
-
-class State(NamedTuple):
-    iteration: int
-    real_steps: int
-    policy: Weights
-    data: Any
-
-
-def a_state(iteration: int = 0) -> State:
-    layers = (
-        (np.full((3, 4), iteration, np.float32), np.zeros(4, np.float32)),
-        (np.ones((4, 2), np.float32), np.zeros(2, np.float32)),
-    )
-    return State(
-        iteration,
-        100 * iteration,
-        Weights(layers, np.zeros(2, np.float32)),
-        np.arange(10 * iteration, dtype=np.float32),
-    )
-
-
-def a_row(iteration: int) -> dict[str, Any]:
-    return {
-        "iteration": iteration,
-        "real_steps": 100 * iteration,
-        "return_real": np.float32(iteration) / 3,
-        "gap": float("nan") if iteration == 1 else 0.1 * iteration,
-        "seconds_fit": 0.5,
-    }
-
-
-def train(path: Path, config: Config = CONFIG, until: int = 5) -> list[int]:
-    """What training.train does with a directory; returns the iterations it ran."""
-    ran = []
-    with RunDirectory(path, config) as run:
-        state = run.load(a_state()) or a_state()
-        while state.iteration < until:
-            state = a_state(state.iteration + 1)
-            run.save(state, a_row(state.iteration))
-            ran.append(state.iteration)
-    return ran
+from places import SUPPORT
 
 
 def contents(path: Path) -> dict[str, bytes]:
@@ -171,7 +123,7 @@ from pathlib import Path
 warnings.simplefilter("ignore")  # JAX warns of forks; it has not started its threads here
 sys.path.insert(0, sys.argv[1])
 import tensorboardX  # once, not in every child
-import test_directory as t
+import blank_run
 from metrpo.run import directory
 directory.draw_curve = lambda rows, path, title, *_: None
 calls, real = 0, {name: getattr(os, name) for name in ("replace", "fsync", "unlink")}
@@ -190,7 +142,7 @@ while status:
     deadline += 2
     child = os.fork()
     if not child:
-        t.train(Path(sys.argv[2]) / str(deadline), t.DETERMINISTIC, until=3)
+        blank_run.train(Path(sys.argv[2]) / str(deadline), blank_run.DETERMINISTIC, until=3)
         os._exit(0)
     _, status = os.waitpid(child, 0)
 print(deadline)
@@ -198,7 +150,7 @@ print(deadline)
 
 
 def test_kill_at_any_write_then_resume_equals_an_uninterrupted_run(tmp_path):
-    command = [sys.executable, "-c", KILLER, str(Path(__file__).parent), str(tmp_path)]
+    command = [sys.executable, "-c", KILLER, str(SUPPORT), str(tmp_path)]
     survived = int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
     assert survived > 30
     expected, interrupted = stable(tmp_path / str(survived)), 0

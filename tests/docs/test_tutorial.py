@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +12,9 @@ import pytest
 from metrpo.commands import main
 from metrpo.run import machine
 from metrpo.run.metrics import read_metrics
+from places import ROOT
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "tutorial.md"
+PAGE = ROOT / "docs" / "tutorial.md"
 FEW = ["--collect.steps", "1500", "--imagine.steps", "500", "--validate.max-updates", "5", "--fit.max-steps", "20"]
 
 

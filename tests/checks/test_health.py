@@ -2,56 +2,17 @@
 
 import dataclasses
 import math
-from pathlib import Path
 
 import pytest
 
 from metrpo.checks.health import CHECKS, examine
 from metrpo.config import Config, EnsembleConfig, ImagineConfig, ValidateConfig
 from metrpo.run.find import find
+from places import RESULTS
+from seen_runs import exploiting, healthy
 
-RESULTS = Path(__file__).resolve().parents[1] / "results"
 CONFIG = Config("Swimmer", validate=ValidateConfig(max_updates=100))
 NAN = math.nan
-
-
-def healthy(count=12):
-    """A run that climbs from 0 to 100 and settles; its models promise too much at first, as good ones do."""
-    rows = []
-    for i in range(1, count + 1):
-        real = 100 * (1 - 0.6**i) + 2 * (-1) ** i
-        imagined = real + 300 * 0.3**i
-        rows.append(
-            {
-                "iteration": i,
-                "real_steps": 3000 * i,
-                "return_real": real,
-                "return_real_std": 10.0,
-                "return_imagined": imagined,
-                "gap": imagined - real,
-                **{f"validation_loss_{k}": (1 + 0.05 * k) * (1 + 2 * 0.7**i) for k in range(5)},
-                "train_loss": 0.5,
-                "updates": 100 if i % 4 else 40,
-                "accepted_updates": 90 if i % 3 else 0,
-                "rejected_steps": 1,
-                "fraction_improved": 0.7,
-                "kl": 0.008,
-                "mean_std": 0.6,
-                "saturated": 0.2,
-                "diverged": 0.0,
-                "error_1": 0.05 + 0.3 * 0.7**i,
-                "error_5": 0.08 + 0.4 * 0.7**i,
-                "error_T": 0.4 + 1.0 * 0.7**i,
-                "disagreement_real": 0.03,
-                "disagreement_imagined": 0.04 + 0.5 * 0.5**i,
-                "outside": 0.1 + 0.5 * 0.5**i,
-                "end_share": 0.02,
-                "end_recall": 0.9,
-                "end_false_alarms": 0.001,
-                "end_error": 0.004,
-            }
-        )
-    return rows
 
 
 def changed(since, **columns):
@@ -67,10 +28,6 @@ def test_a_healthy_run_has_none_at_any_length():
     assert [[c for c in examine(healthy(n), CONFIG) if c.level == "warning"] for n in range(13)] == [[]] * 13
     assert codes(healthy(3)) == ["model-exploited"], "a note, while data are few"
     assert [codes(healthy(n)) for n in range(6, 13)] == [[]] * 7
-
-
-def exploiting():
-    return [r | {"gap": 3 * abs(r["return_real"])} if r["iteration"] >= 5 else r for r in healthy()]
 
 
 def falling():

@@ -97,8 +97,8 @@ def test_the_import_makes_no_environment_and_leaves_jax_alone():
         "import gymnasium, sys\n"
         "def never(*_, **__): raise AssertionError('made at import')\n"
         "gymnasium.make = gymnasium.Env.reset = never\n"
-        "from metrpo.world.tasks import gymnasium_formulas as known\n"
-        "assert len(known.KNOWN) > 10 and 'jax' not in sys.modules and 'pygame' not in sys.modules"
+        "from metrpo.world.tasks.gymnasium_formulas import KNOWN\n"
+        "assert len(KNOWN) > 10 and 'jax' not in sys.modules and 'pygame' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
 

@@ -4,7 +4,6 @@ import csv
 import json
 import runpy
 import subprocess
-from pathlib import Path
 
 import pytest
 
@@ -14,8 +13,8 @@ from metrpo.paper.summary import as_markdown
 from metrpo.paper.summary import summarise as summarise_figure
 from metrpo.run.files import folder_name
 from metrpo.speed.measure import Report
+from places import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 RUNS = sorted(path.parent for path in (ROOT / "results").glob("*/*/*/seed-*/metrics.csv"))
 
 

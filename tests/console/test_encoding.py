@@ -14,6 +14,7 @@ from rich.console import Console
 from metrpo.console.encoding import print_anywhere
 from metrpo.console.progress import LiveProgress, PlainProgress
 from metrpo.run import machine
+from places import GUARANTEES, SUPPORT
 
 ROW = {"iteration": 1, "real_steps": 200, "return_real": 1.5, "return_real_std": 0.5}
 
@@ -73,7 +74,7 @@ def test_progress_is_told_on_an_ascii_terminal():
 @pytest.fixture
 def a_run(tmp_path):
     """A finished run of the probe."""
-    return Path(shutil.copytree(Path(__file__).parent / "guarantees" / "format-1", tmp_path / "run"))
+    return Path(shutil.copytree(GUARANTEES / "format-1", tmp_path / "run"))
 
 
 EVERY = """
@@ -81,18 +82,18 @@ import sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 import probe
-from metrpo import cli
+from metrpo.commands import main
 with probe.registered():
     for command in (["--help"], ["evaluate", sys.argv[2], "--episodes", "1"], ["watch", sys.argv[2], "--once"]):
-        assert cli.main(command) == 0, command
+        assert main.main(command) == 0, command
         print("=====")
-    cli._report(Path(sys.argv[2]), video=False)  # what a finished run says
+    main._report(Path(sys.argv[2]), video=False)  # what a finished run says
 """
 
 
 def test_commands_end_well_in_the_c_locale(a_run):
     environment = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONIOENCODING": ""}
-    command = [sys.executable, "-c", EVERY, str(Path(__file__).parent), str(a_run)]
+    command = [sys.executable, "-c", EVERY, str(SUPPORT), str(a_run)]
     ran = subprocess.run(command, env=environment, capture_output=True)
     assert ran.returncode == 0, ran.stderr
     assert ran.stdout.isascii()
@@ -108,8 +109,8 @@ import os, pwd, sys
 def unknown(*_):
     raise KeyError("getpwuid(): uid not found")
 pwd.getpwuid = unknown  # as for a number that no passwd entry names
-from metrpo import cli
-sys.exit(cli.main(sys.argv[1:]))
+from metrpo.commands import main
+sys.exit(main.main(sys.argv[1:]))
 """
 
 

@@ -1,6 +1,6 @@
 """A real browser for the tests of pages: headless Chromium without a network, driven by its DevTools protocol.
 
-`python tests/browser.py PAGE.html OUT.png --width 390 [--dark] [--height 900]` takes a screenshot, as those in docs/.
+`python tests/support/browser.py PAGE.html OUT.png --width 390 [--dark] [--height 900]` takes a screenshot, as in docs/.
 """
 
 from __future__ import annotations

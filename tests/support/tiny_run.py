@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -20,6 +19,7 @@ from metrpo.run import directory, lock, machine
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.files import atomic_write
 from metrpo.training import train
+from places import SUPPORT
 
 ITERATIONS, EPISODES = 3, 4
 SMALL = {
@@ -172,7 +172,7 @@ import signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what runs in its background
 sys.path.insert(0, sys.argv[1])
 import probe
-from metrpo import cli
+from metrpo.commands import main
 with probe.registered():
     sys.exit(main.main(sys.argv[2:]))
 """
@@ -180,4 +180,4 @@ with probe.registered():
 
 def process_line(run_dir, *more):
     """The same as a process of its own."""
-    return [sys.executable, "-c", PROGRAM, str(Path(__file__).parent), *command_line(run_dir, *more)]
+    return [sys.executable, "-c", PROGRAM, str(SUPPORT), *command_line(run_dir, *more)]

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import types
 import typing
-from pathlib import Path
 
 import pytest
 from hypothesis import given, settings
@@ -16,6 +15,7 @@ from metrpo.config import ADDED, BUDGET_FIELDS, Config, difference, flatten, fro
 from metrpo.errors import ConfigError
 from metrpo.presets import override
 from metrpo.run.files import folder_name
+from places import RESULTS
 
 # A share, a rate, a penalty: what lies between 0 and 1 is possible for every number with a fraction.
 KINDS = {
@@ -320,6 +320,6 @@ def test_override_refuses_a_value_of_the_wrong_kind(name, value):
 def test_a_setting_newer_than_a_file_has_its_default_and_no_other_may_be_missing():
     added = {"__".join(name.split(".")[1:]): ... for name in ADDED}
     assert from_json(edited(**added)) == from_json(edited())
-    committed = sorted((Path(__file__).parents[1] / "results").glob("*/*/*/seed-*/config.json"))
+    committed = sorted(RESULTS.glob("*/*/*/seed-*/config.json"))
     assert committed
     assert [path for path in committed if folder_name(from_json(path.read_text()).task) not in path.parts] == []
