@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import re
 
+import headline
 import mbbl_table
 from summarise import HEADER, ROOT, table
 
 PAGE, FIGURES = ROOT.parent / "docs" / "reproduction.md", ROOT / "laptop" / "figures"
 PAGES = {
-    "README.md": ["laptop/*/me-trpo"],
+    "docs/results.md": ["laptop/*/me-trpo"],
     "docs/fast-preset.md": ["ensemble-size", "fast-after", "fast-before", "fast-choices"],
     "docs/environments.md": ["own"],
 }
@@ -40,7 +41,15 @@ def with_mbbl(page: str) -> str:
     return re.sub(r"(<!-- mbbl -->\n).*?(<!-- end -->)", rf"\1{mbbl_table.table()}\n\2", page, flags=re.DOTALL)
 
 
+def with_headline(page: str) -> str:
+    """The page with the table of `headline.py` made anew."""
+    head = re.escape(f"| {' | '.join(headline.HEADER)} |\n")
+    return re.sub(rf"{head}(\|.*\n)+", lambda _: headline.table() + "\n", page)
+
+
 if __name__ == "__main__":
+    README = ROOT.parent / "README.md"
+    README.write_text(with_headline(README.read_text()))
     PAGE.write_text(with_figures(PAGE.read_text()))
     for name, patterns in PAGES.items():
         path = ROOT.parent / name

@@ -281,7 +281,6 @@ def test_a_finished_run_started_again_writes_what_is_missing_or_damaged(tmp_path
     for name in ("curve.png", "policy.json", "metrics.csv"):
         (tmp_path / name).unlink()
     (tmp_path / "policy.npz").write_bytes(b"torn")
-    (tmp_path / "diagnostics.csv").write_text("damaged")
     train(tmp_path, until=2)
     assert contents() == before
 

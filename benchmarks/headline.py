@@ -1,0 +1,45 @@
+"""The table of the README: returns beside what no skill earns and, where it was searched, the ceiling.
+
+`python benchmarks/fill_tables.py` puts it into the README, from results/EXPERIMENT, results/yardsticks.json
+(`yardsticks.py`) and results/ceilings (`ceiling.py`).
+"""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+from summarise import ROOT
+
+from metrpo import read_metrics
+
+EXPERIMENT = "laptop"
+TASKS = ("Swimmer", "Snake", "HalfCheetah", "Hopper", "HopperUpright", "Ant", "Humanoid", "HumanoidStandup")
+HEADER = ("task", "real steps", "seeds", "return", "worst seed", "doing nothing", "random actions", "ceiling")
+
+
+def table() -> str:
+    """As Markdown, a row for each task that has runs."""
+    rows = [HEADER, tuple("---" for _ in HEADER), *(row for task in TASKS if (row := _row(task)))]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
+
+
+def _row(task: str) -> tuple[str, ...] | None:
+    last = [
+        read_metrics(path)[-1] for path in sorted((ROOT / EXPERIMENT / task / "me-trpo").glob("seed-*/metrics.csv"))
+    ]
+    if not last:
+        return None
+    returns = [float(row["return_real"] or np.nan) for row in last]
+    no_skill = json.loads((ROOT / "yardsticks.json").read_text())[task]
+    file = ROOT / "ceilings" / f"{task}.json"
+    ceiling = f"{json.loads(file.read_text())['best']['mean']:.0f}" if file.exists() else "not searched"
+    return (
+        task,
+        f"{min(int(row['real_steps'] or 0) for row in last):,}",
+        str(len(last)),
+        f"{np.mean(returns):.1f}",
+        f"{np.min(returns):.1f}",
+        *(f"{no_skill[way]['mean']:.1f}" for way in ("zero", "random")),
+        ceiling,
+    )

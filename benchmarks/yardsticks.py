@@ -1,0 +1,35 @@
+"""What doing nothing and random actions earn: `python benchmarks/yardsticks.py [TASK...]`.
+
+Written to results/yardsticks.json: 100 real episodes each way from the resets 0 to 99 (20 where an episode has more
+than 500 steps), mean and standard deviation.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+
+from summarise import ROOT
+
+from metrpo import get_task
+from metrpo.world.yardsticks import measure
+
+FILE = ROOT / "yardsticks.json"
+TASKS = (
+    *("Swimmer", "Snake", "HalfCheetah", "Hopper", "HopperUpright", "Ant", "Humanoid", "HumanoidStandup"),
+    *("mbbl/Swimmer", "mbbl/HalfCheetah", "mbbl/Hopper", "mbbl/Ant"),
+)
+
+
+def main() -> None:
+    """Measures, adds to the file, and prints."""
+    found = json.loads(FILE.read_text()) if FILE.exists() else {}
+    for name in sys.argv[1:] or TASKS:
+        task = get_task(name)
+        found[name] = measure(task, 100 if task.horizon <= 500 else 20).record()
+        print(name, found[name], flush=True)
+        FILE.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
