@@ -129,7 +129,7 @@ def test_commands_are_found():
     assert ["train", "Swimmer", "--seed", "0"] in [command.words for command in mentioned(readme)]
     two = Block(readme, 7, "sh", "metrpo tasks \\\n  --json\nls && $ metrpo doctor > a  # why\n", "")
     assert typed(two) == [("README.md:7", ["tasks", "--json"]), ("README.md:9", ["doctor"])]
-    assert [block.not_run[:10] for block in blocks(ROOT / "docs" / "tutorial.md", "python")] == ["", "tests/test"]
+    assert [block.not_run[:10] for block in blocks(ROOT / "docs" / "tutorial.md", "python")] == ["", "tests/docs"]
 
 
 def known() -> set[str]:

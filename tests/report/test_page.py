@@ -176,7 +176,7 @@ def test_what_is_no_run_is_one_message(tmp_path, capsys):
         (["empty"], "expected a run (config.json and metrics.csv), got none; start one with: metrpo train"),
         (["missing"], "missing: expected a run directory or a folder with runs inside, got nothing"),
         (["file"], "file: expected a run directory or a folder with runs inside, got a file"),
-        ([], "expected at least one run directory or folder with runs, got none"),
+        ([], "report needs run directories, or folders with runs inside: metrpo report runs"),
     ):
         assert report(*arguments) == 2
         out, err = capsys.readouterr()
