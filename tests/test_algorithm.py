@@ -85,7 +85,7 @@ def equal(one, other):
 # ---------------------------------------------------------------- compilation, seeds, purity
 
 
-def test_nothing_compiles_after_the_second_iteration_as_data_grows(tiny):
+def test_nothing_compiles_after_the_second_iteration(tiny):
     assert tiny.counts[0] > 5, "the count must see compilations"
     sizes = [s.dataset.train.size for s in tiny.states]
     assert sizes[3] > sizes[2] > sizes[1], "the data must grow while nothing compiles"
@@ -107,7 +107,7 @@ def test_the_seed_decides_the_whole_run(tiny):
             assert ours[name] != theirs[name], name
 
 
-def test_a_step_leaves_its_state_as_it_was_and_can_be_taken_again(tiny):
+def test_a_step_leaves_its_state_as_it_was_and_can_be_repeated(tiny):
     for at in (0, 2):
         state = tiny.states[at]
         before = jax.tree.map(np.array, state)
@@ -139,7 +139,7 @@ def test_a_budget_of_real_steps_is_spent_and_no_more():
 
 
 @pytest.mark.parametrize("ends", ["Probe", "EndingProbe"])
-def test_collection_stops_at_a_budget_below_what_an_iteration_collects(tiny, ends):
+def test_collection_stops_at_a_budget_below_one_iterations(tiny, ends):
     config = override(TINY, {"task": ends, "real_steps": 33, "collect.steps": 500})
     episodes = algorithm.collect(config, tiny.states[0])
     assert sum(len(e.rewards) for e in episodes) == 33
@@ -223,7 +223,7 @@ def test_rows_say_what_happened(tiny):
     assert len({tuple(r) for r in tiny.rows}) == 1, "the same columns in every row"
 
 
-def test_the_reported_return_is_the_accepted_policys_without_noise(tiny, monkeypatch):
+def test_the_return_is_the_accepted_policys_without_noise(tiny, monkeypatch):
     seen = {}
 
     def evaluate(task, act, episodes, seed, at_most, longest):
@@ -247,7 +247,7 @@ def test_the_first_state_has_seen_nothing(tiny):
 
 
 @pytest.mark.parametrize("accepted", [0, 5])
-def test_the_previous_policy_is_that_before_the_last_phase_that_changed_it(tiny, monkeypatch, accepted):
+def test_the_previous_policy_precedes_the_last_changing_phase(tiny, monkeypatch, accepted):
     policy = random_policy(7, 2, 2, hidden=(4,))
 
     def phase(*args):
@@ -261,7 +261,7 @@ def test_the_previous_policy_is_that_before_the_last_phase_that_changed_it(tiny,
     assert equal(new.previous_policy, old.policy if accepted else old.previous_policy)
 
 
-def test_parameter_noise_is_proportional_to_the_change_of_each_parameter():
+def test_parameter_noise_is_in_proportion_to_each_change():
     now, before = random_policy(0, 3, 2, hidden=(40,)), random_policy(1, 3, 2, hidden=(40,))
     rng = np.random.default_rng(0)
     drawn = [algorithm._perturbed(now, before, 3.0, rng).args[0] for _ in range(2000)]
@@ -415,9 +415,7 @@ def all_models(improvements, worse=-1.0, every=5, count=400, models=5):
         ([40], {"every": 20, "patience": 25}, (40, 80, 40)),
     ],
 )
-def test_the_phase_ends_when_the_patience_is_over_and_returns_to_the_accepted(
-    tiny, monkeypatch, improvements, settings, expected
-):
+def test_out_of_patience_the_phase_returns_to_the_accepted(tiny, monkeypatch, improvements, settings, expected):
     every = settings.get("every", 5)
     script = Script(monkeypatch, tiny, all_models(improvements, every=every), **settings)
     assert script.result == expected
@@ -448,7 +446,7 @@ def test_seventy_percent_of_the_models_decide(tiny, monkeypatch, improved, accep
     assert np.mean(script.info.improved) == pytest.approx(improved / 1000 / count)
 
 
-def test_a_diverged_model_votes_against_and_all_diverged_end_the_phase(tiny, monkeypatch):
+def test_diverged_models_vote_against_and_all_of_them_end_it(tiny, monkeypatch):
     nan = np.nan
     values = {n: [nan] * 4 for n in range(0, 100, 5)}
     assert Script(monkeypatch, tiny, values).result == (0, 25, 0)
@@ -474,7 +472,7 @@ def test_a_rejected_policys_values_are_no_reference(tiny, monkeypatch):
     assert Script(monkeypatch, tiny, values).result == (10, 35, 10)
 
 
-def test_where_episodes_are_cut_both_policies_are_held_against_the_same_value(tiny, monkeypatch):
+def test_cut_episodes_give_both_policies_the_same_value(tiny, monkeypatch):
     """The value at the cut moves with the baseline: the accepted policy is valued anew beside each candidate."""
     script = Script(monkeypatch, tiny, all_models([5]))
     asked = []
@@ -511,7 +509,7 @@ def test_the_oracle_plays_other_starts_than_the_record(tiny, monkeypatch):
 # ---------------------------------------------------------------- normalised states
 
 
-def test_a_phase_on_normalised_states_begins_with_the_same_policy(tiny, monkeypatch):
+def test_a_phase_on_normalised_states_keeps_the_first_policy(tiny, monkeypatch):
     config, ensemble = override(TINY, {"policy.normalise": True}), random_ensemble(0, 2, 2, 2)
     state, seen = tiny.states[2], []
     monkeypatch.setattr(
@@ -540,7 +538,7 @@ def test_parameter_noise_does_not_know_the_units_of_the_states(offset, scale):
     np.testing.assert_allclose(actions(other, offset + scale * rows), actions(plain, rows), atol=0.05)
 
 
-def test_the_standard_deviation_goes_on_where_the_config_has_a_least_one(tiny, monkeypatch):
+def test_the_std_goes_on_where_the_config_has_a_least_one(tiny, monkeypatch):
     script = Script(monkeypatch, tiny, all_models([10]))
     goes_on = override(script.config, {"policy.min_std": 0.2})
     script.state = script.state._replace(policy=script.state.policy._replace(log_std=np.float32([-1.0, -3.0])))
@@ -551,7 +549,7 @@ def test_the_standard_deviation_goes_on_where_the_config_has_a_least_one(tiny, m
     np.testing.assert_allclose(accepted.log_std, np.log(TINY.policy.initial_std) - 10, err_msg="but not into the first")
 
 
-def test_the_standard_deviation_is_set_back_at_the_start_of_the_phase(tiny, monkeypatch):
+def test_the_std_is_set_back_at_the_start_of_the_phase(tiny, monkeypatch):
     script = Script(monkeypatch, tiny, all_models([10]))
     np.testing.assert_allclose(script.accepted.log_std, np.log(TINY.policy.initial_std) - 10)
     np.testing.assert_allclose(Script(monkeypatch, tiny, all_models([])).accepted.log_std, 0.0)
@@ -591,7 +589,7 @@ def test_enough_rollouts_for_the_imagined_steps(steps, horizon, rollouts):
     assert policy_phase.rollouts(override(TINY, {"imagine.steps": steps}), task) == rollouts
 
 
-def test_a_block_of_updates_is_imagination_advantages_and_trpo_one_after_the_other(tiny):
+def test_a_block_is_imagination_advantages_and_trpo_in_turn(tiny):
     """Each update imagines with the policy of the one before, and is judged by the baseline of the one before."""
     # Ten conjugate-gradient iterations make a last bit of the starts 5e-3 of the weights, two make it 1e-6.
     config = override(TINY, {"trpo.cg_iterations": 2})

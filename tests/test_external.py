@@ -96,7 +96,7 @@ def test_steps_and_the_loop_take_turns(uninterrupted, tmp_path):
 
 
 @pytest.mark.parametrize("episode", [1, 3, 5])
-def test_episodes_before_the_environment_broke_are_not_played_again(uninterrupted, tmp_path, monkeypatch, episode):
+def test_episodes_before_the_environment_broke_are_kept(uninterrupted, tmp_path, monkeypatch, episode):
     train(dataclasses.replace(config(), iterations=1), tmp_path)
     monkeypatch.setattr(Fragile, "left", episode)
     with pytest.raises(TaskError, match="the motor is hot"):
@@ -123,7 +123,7 @@ def test_a_broken_environment_ends_with_how_to_go_on(tmp_path, monkeypatch, caps
     assert len(EpisodeLog(tmp_path / "run").pending()) == 2
 
 
-def test_a_damaged_checkpoint_costs_its_iteration_and_no_real_episode(uninterrupted, tmp_path, caplog, monkeypatch):
+def test_a_damaged_checkpoint_costs_no_real_episode(uninterrupted, tmp_path, caplog, monkeypatch):
     train(config(), tmp_path)
     newest = tmp_path / "checkpoints" / "iteration-00002.npz"
     newest.write_bytes(newest.read_bytes()[:-1])
@@ -173,7 +173,7 @@ def test_what_needs_an_environment_is_refused_without_one(tmp_path, setting):
         external.begin(config("Elsewhere", **setting), tmp_path)
 
 
-def test_what_the_budget_leaves_is_collected_and_more_only_when_asked_for(tmp_path):
+def test_more_than_the_budget_is_collected_only_when_asked_for(tmp_path):
     external.begin(dataclasses.replace(config(), real_steps=33), tmp_path)
     waiting = external.collect(tmp_path)
     assert sum(len(e.rewards) for e in waiting) == 33

@@ -88,7 +88,7 @@ def dataset_of(episodes, old=None):
 # ---------------------------------------------------------------- the origin
 
 
-def test_the_origin_is_the_mean_of_dimensions_far_from_0_and_0_in_others():
+def test_the_origin_is_the_mean_of_dimensions_far_from_0():
     states = episode(np.array([1e8, 3.0, 0.0, 5000.0]), size=4).states
     states[:, 2] = 7.0  # does not vary
     origin = origin_of(states)
@@ -117,7 +117,7 @@ def test_without_an_offset_everything_is_as_float32_has_it():
         assert {x.dtype for x in found.train[:3]} == {np.dtype(np.float32)}
 
 
-def test_the_first_data_decide_and_later_ones_are_counted_from_the_same():
+def test_the_first_data_decide_the_origin_of_later_ones():
     first = dataset_of([episode(FAR)])
     later = dataset_of([episode(2 * FAR, seed=1)], first)
     np.testing.assert_array_equal(later.origin, first.origin)
@@ -186,7 +186,7 @@ def test_an_origin_that_does_not_fit_is_refused(tmp_path, origin):
         load_policy(tmp_path)
 
 
-def test_a_checkpoint_from_before_has_no_origin_and_another_size_is_refused(tmp_path):
+def test_an_old_checkpoint_has_no_origin_another_size_is_refused(tmp_path):
     path = tmp_path / "state.npz"
     state = algorithm.State(*[0] * 6, datasets.empty(2, 1))
     save_state(path, state, {})
@@ -201,7 +201,7 @@ def test_a_checkpoint_from_before_has_no_origin_and_another_size_is_refused(tmp_
         load_state(path, state)
 
 
-def test_an_episode_on_disk_keeps_its_digits_and_an_old_one_is_read(tmp_path):
+def test_an_episode_keeps_its_digits_and_an_old_one_is_read(tmp_path):
     log = EpisodeLog(tmp_path)
     (tmp_path / "episodes").mkdir()
     exact = episode(FAR)
@@ -300,7 +300,7 @@ def found_in(offset, scale=1.0, config=None, states=None):
     return scales.findings(config or preset("Swimmer"), task, dataset_of([e]), [e]), task
 
 
-def test_usual_observations_offsets_and_small_ones_are_not_worth_a_word():
+def test_usual_observations_and_small_offsets_give_no_warning():
     for offset, scale in ((0, 1), (1e8, 1), (0, 1e-6), (5000, 1e-3)):
         assert found_in(offset, scale) == ([], found_in(0)[1])
     assert found_in(0, config=preset("Swimmer", "paper"))[0] == []

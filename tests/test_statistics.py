@@ -157,7 +157,7 @@ def mean(scores):
     return np.mean([task.mean(axis=0) for task in scores], axis=0)
 
 
-def test_the_interval_of_a_mean_is_that_of_the_normal_distribution():
+def test_the_interval_of_a_mean_is_the_normal_distributions():
     scores = np.random.default_rng(0).normal(size=(400, 2)) * [1.0, 3.0]
     low, high = stratified_bootstrap(mean, scores, repetitions=4000)
     half = 1.96 * np.sqrt(np.var(scores, axis=0).sum() / 400) / 2
@@ -223,7 +223,7 @@ def test_the_seed_decides_the_interval():
 
 @settings(max_examples=30)
 @given(tables())
-def test_an_interval_lies_within_the_scores_and_grows_with_its_level(scores):
+def test_an_interval_is_within_the_scores_and_grows_with_level(scores):
     wide = stratified_bootstrap(iqm, scores, repetitions=60, level=0.9)
     narrow = stratified_bootstrap(iqm, scores, repetitions=60, level=0.5)
     assert scores.min() - 1e-9 <= wide[0] <= narrow[0] <= narrow[1] <= wide[1] <= scores.max() + 1e-9

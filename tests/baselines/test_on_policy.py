@@ -89,7 +89,7 @@ def test_episodes_lie_side_by_side_and_end_where_they_ended():
 # ---------------------------------------------------------------- TRPO
 
 
-def test_trpo_finds_the_optimum_of_the_probe_in_the_real_environment():
+def test_trpo_finds_the_probes_optimum_in_the_real_environment():
     told = Rows()
     state = training.train(TRPO, None, told)
     assert state.real_steps == 30 * 400
@@ -228,7 +228,7 @@ def test_svg_inf_is_on_average_the_exact_policy_gradient():
         assert np.any(np.abs(theirs) > 20 * error), "a gradient of zero would pass"
 
 
-def test_svg_1_is_the_gradient_of_one_step_and_the_value_after_it():
+def test_svg_1_differentiates_one_step_and_the_value_after_it():
     rng = np.random.default_rng(2)
     path, noise = path_of(rng, WEIGHTS, BIAS, STD, 6)
     model = random_ensemble(3, members=1, state_size=2, action_size=2, scale=0.5)

@@ -94,7 +94,7 @@ def test_the_networks_and_adam_change_and_are_kept(runs, method):
 
 
 @METHODS
-def test_the_state_goes_into_the_librarys_objects_and_comes_out_again(runs, method):
+def test_the_state_goes_into_the_library_and_comes_out_again(runs, method):
     config, state = override(TINY, {"method": method}), runs[method][0][3]
     env = stable_baselines._environment(config)
     assert equal(stable_baselines._state(config, stable_baselines._model(config, env, 0, state), 3), state)
@@ -102,7 +102,7 @@ def test_the_state_goes_into_the_librarys_objects_and_comes_out_again(runs, meth
 
 
 @METHODS
-def test_a_step_leaves_its_state_as_it_was_and_can_be_taken_again(runs, method):
+def test_a_step_leaves_its_state_as_it_was_and_can_be_repeated(runs, method):
     config, (states, rows) = override(TINY, {"method": method}), runs[method]
     before = jax.tree.map(np.array, states[1])
     again, row = stable_baselines.step(config, states[1])
@@ -114,7 +114,7 @@ def test_a_step_leaves_its_state_as_it_was_and_can_be_taken_again(runs, method):
 
 
 @METHODS
-def test_a_checkpoint_gives_the_state_back_and_the_run_goes_on_as_if_uninterrupted(runs, method, tmp_path):
+def test_a_resumed_run_equals_an_uninterrupted_one(runs, method, tmp_path):
     config, (states, _) = override(TINY, {"method": method}), runs[method]
     save_state(tmp_path / "state.npz", states[2], {})
     # Nothing may hang on what this process has drawn before.
@@ -316,7 +316,7 @@ def test_networks_see_observations_by_their_statistics(runs, method):
     assert np.ptp(expected) > 0.02
 
 
-def test_the_critic_normalises_its_layers_and_takes_the_action_in_its_second():
+def test_the_critic_normalises_layers_and_takes_actions_second():
     torch.manual_seed(0)
     critic = defaults._Value(3, 2, (5, 4))
     for norm in critic.norms:

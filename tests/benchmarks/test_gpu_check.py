@@ -52,7 +52,7 @@ def test_what_hangs_or_fails_is_said_and_ended(check):
     assert within([sys.executable, "-c", "import time; time.sleep(60)"], 0.2) == "out of time"
 
 
-def test_the_record_is_written_after_every_part_whatever_became_of_it(check, tmp_path, monkeypatch):
+def test_the_record_is_written_after_every_part(check, tmp_path, monkeypatch):
     outcomes = iter(["done", "out of time", "failed with exit code 1", "done", "done", "done"])
     out, seen = tmp_path / "gpu.json", []
 
@@ -77,7 +77,7 @@ def test_the_record_is_written_after_every_part_whatever_became_of_it(check, tmp
     }
 
 
-def test_a_preset_is_timed_iteration_by_iteration_as_long_as_there_is_time(check, monkeypatch):
+def test_a_presets_iterations_are_timed_while_time_is_left(check, monkeypatch):
     row = {"real_steps": 9, "return_real": 1.0, "return_imagined": 2.0, "updates": 5, "accepted_updates": 5}
     row |= {"fit_passes": 5, "seconds_fit": 1.0, "seconds_improve": 3.0, "seconds_validate": 1.0}
 

@@ -117,7 +117,7 @@ def test_a_video_is_made_again_only_for_another_policy(capsys, monkeypatch):
 TEN = ["--ensemble.members", "10"]
 
 
-def test_other_settings_have_another_directory_and_the_same_command_the_same(capsys):
+def test_the_default_directory_follows_from_the_settings(capsys):
     """The README's own order: the usual run, then one with a setting of its own."""
     usual, ten = "runs/Swimmer-fast-seed0", "runs/Swimmer-fast-seed0-ensemble.members=10"
     for command, where, iterations in (
@@ -401,7 +401,7 @@ def test_switches_and_methods_read_the_right_way(capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("preset_", ["fast", "paper"])
-def test_a_setting_that_is_on_or_off_has_both_forms_whatever_the_preset(capsys, preset_):
+def test_a_switch_has_both_forms_whatever_the_preset(capsys, preset_):
     assert run("train", "Swimmer", "--preset", preset_, "--help-all") == 0
     assert "--policy.normalise, --policy.no-normalise" in capsys.readouterr().out
     for value, option in ((True, "--policy.normalise"), (False, "--policy.no-normalise")):

@@ -255,7 +255,7 @@ def edited(**changes):
         (edited(trpo__max_kl=float("nan")), ["trpo.max_kl: expected a finite number > 0, got nan"]),
     ],
 )
-def test_a_wrong_file_is_refused_with_the_place_the_expected_and_the_got(text, parts):
+def test_a_wrong_file_is_refused_with_place_expected_and_got(text, parts):
     with pytest.raises(ConfigError) as error:
         from_json(text)
     for part in parts:
@@ -271,7 +271,7 @@ anything = st.recursive(
 
 @given(st.sampled_from(NAMES), anything)
 @settings(max_examples=200, deadline=None)
-def test_whatever_stands_in_a_file_makes_a_config_or_one_clear_error(name, value):
+def test_any_file_makes_a_config_or_one_clear_error(name, value):
     try:
         config = from_json(edited(**{name.replace(".", "__"): value}))
     except ConfigError as error:
@@ -317,7 +317,7 @@ def test_override_refuses_a_value_of_the_wrong_kind(name, value):
         override(Config(task="x"), {name: value})
 
 
-def test_a_setting_newer_than_a_file_has_its_default_and_no_other_may_be_missing():
+def test_only_settings_newer_than_a_file_may_be_missing_from_it():
     added = {"__".join(name.split(".")[1:]): ... for name in ADDED}
     assert from_json(edited(**added)) == from_json(edited())
     committed = sorted(RESULTS.glob("*/*/*/seed-*/config.json"))

@@ -66,7 +66,7 @@ def test_a_resumed_run_says_so(iteration, of, said):
     assert out.getvalue().splitlines() == [said] * 3
 
 
-def test_what_a_run_has_earned_is_said_even_where_evaluation_failed():
+def test_a_runs_return_is_shown_even_where_evaluation_failed():
     nothing = ROW | {"return_real": float("nan"), "return_collected": 4.0}
     run_dir = Path("a dir")
     assert outcome(ROW, run_dir) == "return 12.3 ± 0.5 after 3,000 real steps"
@@ -110,7 +110,7 @@ def test_the_live_display_shows_stage_bar_and_results():
         assert part in text
 
 
-def test_finished_iterations_stay_on_one_line_in_a_narrow_terminal():
+def test_iterations_stay_on_one_line_in_a_narrow_terminal():
     out = io.StringIO()
     play(LiveProgress(Console(file=out, force_terminal=True, width=40)))
     text = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", out.getvalue())

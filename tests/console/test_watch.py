@@ -336,7 +336,7 @@ def test_plot_draws_what_is_asked_for(tmp_path, monkeypatch):
     assert len(panels["Swimmer"].collections) == 1, "one band"
 
 
-def test_plot_draws_diagnostics_against_the_steps_of_their_iterations(tmp_path, monkeypatch):
+def test_plot_draws_diagnostics_against_their_iterations_steps(tmp_path, monkeypatch):
     from matplotlib.figure import Figure
 
     drawn = []
@@ -397,7 +397,7 @@ def test_a_mean_curve_is_where_all_seeds_are(tmp_path):
 
 
 @pytest.mark.parametrize(("log", "log_y"), [(False, False), (True, False), (False, True), (True, True)])
-def test_the_band_of_two_seeds_contains_their_lines_as_they_are_drawn(tmp_path, log, log_y):
+def test_the_band_of_two_seeds_contains_their_drawn_lines(tmp_path, log, log_y):
     """Between its points a line is straight on the axes, logarithmic ones too."""
     for seed, (steps, values) in enumerate([([1000, 50_000], [0.01, 0.9]), ([900, 2000, 60_000], [1.0, 0.02, 0.5])]):
         rows = [
@@ -419,7 +419,7 @@ def test_the_band_of_two_seeds_contains_their_lines_as_they_are_drawn(tmp_path, 
     assert np.median(np.abs(high - both.max(axis=0))) < 1e-9
 
 
-def test_points_that_a_logarithmic_axis_does_not_have_are_left_out(tmp_path):
+def test_points_off_a_logarithmic_axis_are_left_out(tmp_path):
     rows = [{"iteration": i, "real_steps": 1000 * i, "return_real": [0.5, 0.1, 0.2][i]} for i in range(3)]
     a_run(tmp_path / "a", CONFIG, rows)
     (only,) = group(find([tmp_path]).runs)

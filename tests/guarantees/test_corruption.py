@@ -230,7 +230,7 @@ def test_damaged_files_cost_an_iteration_at_most_or_are_named(real, damages):
 
 @pytest.mark.slow
 @_trials(2000, most=4)
-def test_damaged_files_cost_an_iteration_at_most_or_are_named_in_thousands_of_trials(real, damages):
+def test_thousands_of_damaged_files_cost_an_iteration_at_most(real, damages):
     trial(real, [Damage(real.files[file], deed, number) for file, deed, number in damages])
 
 

@@ -60,9 +60,7 @@ def uninterrupted(tmp_path_factory):
 
 
 @pytest.mark.parametrize(("iteration", "stage"), [(1, "improve"), *((2, stage) for stage in STAGES)])
-def test_a_run_killed_in_any_stage_and_resumed_ends_byte_for_byte_like_an_uninterrupted_one(
-    iteration, stage, uninterrupted, tmp_path
-):
+def test_a_run_killed_in_any_stage_resumes_byte_for_byte(iteration, stage, uninterrupted, tmp_path):
     run_dir = tmp_path / "run"
     process = start(run_dir)
     for line in process.stdout:

@@ -56,7 +56,7 @@ def output(run_dir):
     return [(run_dir / name).read_bytes() for name in DERIVED]
 
 
-def test_twenty_runs_started_at_once_all_finish_as_they_would_alone(tmp_path):
+def test_twenty_runs_started_at_once_finish_as_they_would_alone(tmp_path):
     cache = tmp_path / "cache"
     together = [start(tmp_path / f"run-{n}", n // 2, cache) for n in range(RUNS)]
     said = [process.communicate()[0] for process in together]

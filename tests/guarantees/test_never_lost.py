@@ -202,7 +202,7 @@ def killed_at(steps):
     return update
 
 
-def test_where_every_episode_fails_it_is_said_and_nothing_goes_on(tmp_path, taught, monkeypatch, capsys):
+def test_the_run_stops_where_every_episode_fails(tmp_path, taught, monkeypatch, capsys):
     monkeypatch.setattr(Sick, "sickness", staticmethod(lambda start, step: step == 2))
     run_dir = tmp_path / "run"
     assert main.main(tiny_run.command_line(run_dir)) == 2

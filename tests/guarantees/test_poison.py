@@ -144,7 +144,7 @@ PLACES = [("observation", None), ("observation", 0), ("observation", 17), ("rewa
 
 @pytest.mark.parametrize("value", [*POISON, 1e39, -3e38])
 @pytest.mark.parametrize(("what", "at"), PLACES)
-def test_a_sick_environment_is_named_with_stage_iteration_and_step(clean, monkeypatch, caplog, what, at, value):
+def test_a_sick_environment_is_named_with_stage_and_step(clean, monkeypatch, caplog, what, at, value):
     """1e39 is infinite in float32; from -3e38 to 3e38 it is farther than float32 reaches."""
     where = r"reset\(\)" if at is None else f"step {at} of an episode"
     message = f"iteration 2: Probe: {where}: expected finite numbers below 1.7e38 as {what}, got"
@@ -197,7 +197,7 @@ def test_the_run_goes_on_without_what_was_sick(clean, tmp_path, caplog, what, at
 
 
 @pytest.mark.parametrize("stage", ["improve", "validate"])
-def test_resets_and_oracles_within_the_policy_phase_name_their_stage(clean, monkeypatch, caplog, stage):
+def test_resets_and_oracles_in_the_policy_phase_name_their_stage(clean, monkeypatch, caplog, stage):
     """A reset is drawn again; a policy that cannot be judged is no improvement."""
     settings = {"imagine.start": "reset"} if stage == "improve" else {"validate.rule": "real"}
     Sick(monkeypatch, "observation", None, math.nan)
@@ -280,7 +280,7 @@ def test_what_no_stage_has_noticed_is_not_saved(clean, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("value", POISON)
-def test_the_other_methods_are_held_to_it_as_they_end_an_iteration(monkeypatch, tmp_path, value):
+def test_the_other_methods_are_checked_as_they_end_an_iteration(monkeypatch, tmp_path, value):
     config = override(TINY, {"method": "trpo"})
 
     def step(config, state, progress):
@@ -307,7 +307,7 @@ def member_poisoned(networks, k, value, leaf=0):
 
 @pytest.mark.parametrize("value", [*POISON, 1e30])
 @pytest.mark.parametrize("leaf", LEAVES)
-def test_a_poisoned_member_is_made_anew_and_the_others_are_as_undisturbed(clean, caplog, leaf, value):
+def test_a_poisoned_member_is_made_anew_and_disturbs_no_other(clean, caplog, leaf, value):
     state = clean.states[0]._replace(networks=member_poisoned(clean.states[0].networks, 1, value, LEAVES[leaf]))
     ensemble, info = algorithm._fit(TINY, probe.PROBE, state.networks, clean.states[1].dataset, 2, SILENT)
     assert (info.resets, sound(ensemble), sound(info)) == (1, True, True)
@@ -402,7 +402,7 @@ def in_imagination(clean, ensemble, settings=None):
 
 
 @pytest.mark.parametrize("value", [*POISON, 1e20])
-def test_a_member_that_explodes_takes_its_own_rollouts_and_nothing_else(clean, value):
+def test_an_exploding_member_costs_its_own_rollouts_only(clean, value):
     ensemble = clean.fits[1][0]
     ensemble = ensemble._replace(networks=member_poisoned(ensemble.networks, 1, value, 3))
     policy, baseline, info = in_imagination(clean, ensemble, {"imagine.sampling": "eps_rand"})
@@ -579,7 +579,7 @@ def test_a_step_out_of_the_finite_numbers_is_not_made(name):
 # ---------------------------------------------------------------- validation
 
 
-def test_rollouts_that_all_diverged_are_no_improvement_over_a_loss():
+def test_rollouts_that_all_diverged_improve_nothing():
     """Nothing is counted in them, which is more than -100."""
     config = TINY.validate
     rule = RULES["trpo_mean"]

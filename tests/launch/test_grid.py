@@ -35,7 +35,7 @@ def test_every_combination_is_a_run_of_its_own():
     assert (c.trpo.max_kl, c.ensemble.hidden, c.deterministic) == (0.05, (16, 16), True)
 
 
-def test_a_combination_with_a_long_name_has_a_folder_that_every_disk_takes(tmp_path):
+def test_a_long_combination_has_a_folder_name_every_disk_takes(tmp_path):
     many = {
         "ensemble.members": [2],
         "ensemble.hidden": [[256, 256, 256]],

@@ -32,7 +32,7 @@ def test_by_hand():
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.integers(1, 300))
-def test_what_is_certain_and_right_has_no_error_and_its_opposite_all(seed, members, count):
+def test_certain_and_right_has_no_error_its_opposite_all(seed, members, count):
     ended = np.random.default_rng(seed).uniform(size=count) < 0.4
     right = np.broadcast_to(ended.astype(float), (members, count))
     found = calibration(right, ended)
@@ -50,7 +50,7 @@ def test_probabilities_that_say_how_often_have_almost_no_error():
     assert found.recall == pytest.approx(0.75, abs=0.02)  # E[p; p > 1/2] / E[p] = (3/8) / (1/2)
 
 
-def test_the_ensemble_is_asked_for_its_last_output_member_by_member():
+def test_each_members_last_output_is_what_is_calibrated():
     # two members that "predict" the next state s + a of one number, and an end of p = 0.6 s and 0.4 s
     matrices = [(np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([[1.0], [0.0]]))] * 2
     ensemble = linear_ensemble(matrices)

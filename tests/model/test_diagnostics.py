@@ -37,7 +37,7 @@ def of(matrices, data, horizon=LENGTH):
     return diagnose(linear_ensemble(matrices), policy, held_out, train, horizon, jax.random.key(0))
 
 
-def test_an_exact_model_makes_no_error_and_members_that_are_equal_do_not_disagree(data):
+def test_exact_models_make_no_error_and_equal_ones_agree(data):
     found = of([(A, B)] * 3, data)
     assert list(found.errors) == [*HORIZONS, LENGTH]
     assert all(error.max() < 1e-4 for error in found.errors.values())
@@ -79,7 +79,7 @@ def test_predictions_never_run_over_the_end_of_an_episode(data):
     assert (rows % LENGTH == 0).sum() >= 50, "whole episodes are predicted, too"
 
 
-def test_an_error_over_more_steps_than_any_episode_has_is_unknown(data):
+def test_an_error_over_more_steps_than_any_episode_is_unknown(data):
     found = of([(A, B)], data, horizon=100)
     assert np.isnan(found.errors[100]).all()
     row = found.row()
@@ -98,6 +98,6 @@ def test_imagined_states_beyond_the_data_are_counted(data):
     assert of([(np.nan * A, B)], data).outside == 1
 
 
-def test_members_that_differ_disagree_more_the_further_imagination_goes(data):
+def test_disagreement_grows_with_the_length_of_imagination(data):
     found = of([(A, B), (1.1 * A, B)], data)
     assert found.disagreement_imagined > found.disagreement_real > 0

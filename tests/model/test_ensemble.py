@@ -101,7 +101,7 @@ def test_normaliser_never_divides_by_less_than_the_floor():
     np.testing.assert_allclose(n.delta_std, [0.25, 0.25, x[:, 2].std()], rtol=1e-4)
 
 
-def test_unseen_dimensions_have_no_influence_and_are_predicted_all_the_same():
+def test_unseen_dimensions_are_predicted_but_have_no_influence():
     rng = np.random.default_rng(8)
     train = random_transitions(rng, 50)
     normaliser = ensembles.normaliser_of(train, 0.1, 0.1, unseen=(0, 2))
@@ -118,7 +118,7 @@ def test_unseen_dimensions_have_no_influence_and_are_predicted_all_the_same():
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float32", 1e-5), ("bfloat16", 1e-2)])
-def test_products_and_their_gradients_are_those_of_the_operands_as_rounded(dtype, tolerance):
+def test_products_and_gradients_are_those_of_rounded_operands(dtype, tolerance):
     """The products of bfloat16 numbers are exact in float32, so only rounding may show: the operands', and that of the
     gradient, which has the weights' type."""
     rng = np.random.default_rng(0)
@@ -136,7 +136,7 @@ def test_products_and_their_gradients_are_those_of_the_operands_as_rounded(dtype
     np.testing.assert_allclose(np.asarray(to_weights, np.float32), expected, rtol=tolerance, atol=tolerance)
 
 
-def test_products_in_bfloat16_change_predictions_little_and_float32_ones_not_at_all():
+def test_bfloat16_products_change_predictions_only_a_little():
     ensemble = jax.tree.map(jnp.asarray, random_ensemble(hidden=(16, 16)))
     rng = np.random.default_rng(1)
     states, actions = (rng.normal(size=(3, 50, n)).astype(np.float32) for n in (4, 2))

@@ -45,7 +45,7 @@ def test_validation_loss_is_the_mean_over_the_rows_that_count(size):
     np.testing.assert_allclose(got, slow_validation_loss(ensemble, validation), rtol=1e-4)
 
 
-def test_validation_loss_in_either_unit_of_a_capacity_below_one_chunk():
+def test_validation_loss_below_one_chunk_in_either_unit():
     ensemble = random_ensemble(0, members=2, hidden=(3,))
     validation = random_transitions(np.random.default_rng(0), 7)
     for units in ("raw", "std"):
@@ -122,7 +122,7 @@ NOISY = FitConfig(learning_rate=0.03, batch_size=10, validate_every=2, max_passe
     ],
     ids=["minibatches", "decay and units of std", "fewer rows than a minibatch"],
 )
-def test_every_member_is_trained_alone_and_goes_back_to_its_own_best(size, config):
+def test_each_member_trains_alone_and_returns_to_its_own_best(size, config):
     """Each slice equals that member's training by itself; few noisy rows make the best passes differ."""
     ensemble = random_ensemble(3, hidden=(8,))
     rng = np.random.default_rng(size)
@@ -191,7 +191,7 @@ def test_the_first_member_of_many_is_the_only_member_of_one():
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
 
-def test_members_trained_at_once_end_as_members_trained_one_after_another(monkeypatch):
+def test_members_trained_at_once_equal_those_trained_in_turn(monkeypatch):
     """As on a GPU, and as on a CPU."""
     train, validation = a_system(60)[0], a_system(30, seed=1)[0]
     start = random_ensemble(1)._replace(normaliser=ensembles.normaliser_of(train, 0.1, 0.1))
@@ -236,7 +236,7 @@ def test_a_diverged_member_keeps_its_best_weights():
         ([[], []], {"max_steps": 3000}, 25),
     ],
 )
-def test_fitting_stops_when_no_member_has_improved_for_the_patience(monkeypatch, improvements, settings, passes):
+def test_fitting_stops_when_no_member_improves_within_patience(monkeypatch, improvements, settings, passes):
     """With the passes after which each of two members improves given."""
     config = FitConfig(**settings)
     trained = []

@@ -104,7 +104,7 @@ def test_actions_are_recorded_as_drawn_from_the_policy():
     )
 
 
-def test_returns_per_model_in_the_true_dynamics_are_the_real_returns():
+def test_returns_in_the_true_dynamics_are_the_real_returns():
     policy = random_policy(3, 2, 2)
     for task in (probe.PROBE, probe.ENDING_PROBE):
         real = [
@@ -137,7 +137,7 @@ def test_returns_per_model_are_those_of_a_slow_loop(terminated):
     assert len(np.unique(np.round(slow.mean(1), 2))) == 3, "the models must differ"
 
 
-def test_what_follows_the_last_step_is_worth_its_value_and_rewards_are_discounted():
+def test_the_last_step_is_followed_by_a_discounted_value():
     ensemble, policy = random_ensemble(5, members=2, state_size=2, action_size=2, scale=0.3), random_policy(6, 2, 2)
     starts = np.random.default_rng(0).uniform(-0.7, 0.7, (5, 2)).astype(np.float32)
     slow = np.zeros((2, 5))
@@ -224,7 +224,7 @@ def test_a_reward_that_is_no_number_masks_its_rollout():
     assert all(np.all(np.isfinite(x)) for x in t)
 
 
-def test_rollouts_that_meet_a_model_of_nan_are_masked_and_the_others_count():
+def test_only_rollouts_that_meet_a_model_of_nan_are_masked():
     """One of two models is broken: a rollout of 2 steps survives with probability 1/4."""
     t, info = imagined_without_policy(growing([1.0, np.nan]), np.ones((400, 1), np.float32), KEY, plain, horizon=2)
     assert all(np.all(np.isfinite(x)) for x in t)
@@ -276,7 +276,7 @@ def test_model_choice_is_uniform_for_every_state(count, members):
 
 
 @pytest.mark.parametrize(("count", "members"), [(12, 3), (13, 5), (2, 3)])
-def test_in_imagination_models_are_uniform_and_independent_from_step_to_step(count, members):
+def test_models_are_drawn_uniformly_and_anew_at_every_step(count, members):
     """Member k adds 1 to dimension k: the states tell who was drawn."""
     networks = ((np.zeros((members, members + 1, members), np.float32), np.eye(members, dtype=np.float32)[:, None]),)
     ensemble = Ensemble(networks, linear_ensemble([(np.eye(members), np.zeros((members, 1)))]).normaliser)
@@ -327,7 +327,7 @@ def test_disagreement_is_the_spread_of_the_predictions():
     assert np.abs(jax.jit(imagining.disagreement)(true_dynamics(), states[:, :2], actions)).max() < 1e-4
 
 
-def test_curiosity_adds_the_disagreement_to_imagined_rewards_and_values():
+def test_curiosity_adds_disagreement_to_rewards_and_values():
     ensemble = random_ensemble(1, members=3, state_size=2, action_size=2, scale=0.3)
     policy, starts = random_policy(2, 2, 2), probe.starts(4).astype(np.float32)
     act = partial(gaussian.sample, policy)

@@ -77,7 +77,7 @@ def test_the_table_holds_every_sampling_that_can_be_configured():
 
 @pytest.mark.parametrize("sampling", DRAWN)
 @pytest.mark.parametrize("count", [9, 10])
-def test_each_next_state_is_one_models_and_each_model_is_drawn_equally_often(sampling, count):
+def test_each_next_state_is_one_models_all_drawn_equally_often(sampling, count):
     ensemble = random_ensemble(0, MEMBERS)
     states, actions = some(count)
     predictions = slow_predictions(ensemble, states, actions)
@@ -95,7 +95,7 @@ def test_each_next_state_is_one_models_and_each_model_is_drawn_equally_often(sam
 
 
 @pytest.mark.parametrize(("sampling", "its"), [("step_rand", 0), ("eps_rand", 1)])
-def test_step_rand_hears_the_steps_key_alone_and_eps_rand_the_episodes(sampling, its):
+def test_step_rand_uses_the_steps_key_and_eps_rand_the_episodes(sampling, its):
     ensemble, (states, actions) = random_ensemble(1, MEMBERS), some(20, 1)
     before, other = sample(sampling, ensemble, states, actions), jax.random.key(7)
     by_step = sample(sampling, ensemble, states, actions, KEYS._replace(step=other))
@@ -118,7 +118,7 @@ def imagined_models(sampling, key, count=10, horizon=12, members=MEMBERS):
     return drawn_models(states[1:].reshape(-1, 2), np.array(following).reshape(members, -1, 2)).reshape(-1, count)
 
 
-def test_eps_rand_keeps_each_episodes_model_and_step_rand_draws_anew():
+def test_eps_rand_keeps_an_episodes_model_step_rand_draws_anew():
     whole = imagined_models("eps_rand", 0)
     np.testing.assert_array_equal(whole, np.broadcast_to(whole[0], whole.shape))
     assert set(whole[0]) == {0, 1, 2}, "not one model for all episodes"
@@ -131,7 +131,7 @@ def test_eps_rand_keeps_each_episodes_model_and_step_rand_draws_anew():
     assert stats.binomtest(int(kept.sum()), kept.size, 1 / MEMBERS).pvalue > 1e-4
 
 
-def test_each_episodes_model_is_drawn_equally_often_over_many_batches():
+def test_each_episodes_model_is_drawn_equally_often():
     models = np.array([imagined_models("eps_rand", key)[0] for key in range(200)])
     for n in (0, 4, 9):
         assert stats.chisquare(np.bincount(models[:, n], minlength=MEMBERS)).pvalue > 1e-4
@@ -177,7 +177,7 @@ def test_of_one_model_every_sampling_is_its_prediction():
 # ---------------------------------------------------------------- a normal distribution of the predictions
 
 
-def test_model_mean_std_draws_from_the_normal_distribution_of_the_predictions():
+def test_model_mean_std_draws_from_the_predictions_normal():
     ensemble, (states, actions) = random_ensemble(2, 5), some(2, 2)
     predictions, draws = slow_predictions(ensemble, states, actions), 4000
     many = jax.random.split(jax.random.key(4), draws)
@@ -220,7 +220,7 @@ def gradients(ensemble, states, actions):
     return {name: jax.grad(partial(total, name), (0, 1))(states, actions) for name in SAMPLINGS}
 
 
-def test_where_all_models_agree_every_sampling_is_their_prediction_with_its_gradient():
+def test_every_sampling_of_equal_models_is_their_prediction():
     """The standard deviation is 0 there, where a square root has no slope."""
     one = random_ensemble(3, 1)
     # Of two equal predictions the mean is exact, so that no rounding makes the variance positive.

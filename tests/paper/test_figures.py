@@ -59,7 +59,7 @@ def runs(system, seeds, task="Swimmer", iterations=3):
 # ---------------------------------------------------------------- the tables
 
 
-def test_every_system_is_in_a_figure_and_every_figure_has_its_systems():
+def test_every_system_is_in_a_figure_and_every_figure_has_some():
     named = {system for figure in FIGURES.values() for system in figure.systems.values()}
     assert named == set(SYSTEMS)
     for figure in FIGURES.values():
@@ -160,7 +160,7 @@ def test_only_what_is_missing_is_run(tmp_path, trained):
     assert begun == []
 
 
-def test_a_run_that_fails_does_not_stop_the_others_and_is_told_with_its_last_words(tmp_path, trained):
+def test_a_failed_run_stops_no_other_and_leaves_last_words(tmp_path, trained):
     outcomes, begun = trained
     all_runs = runs("k-1", 4)
     outcomes[all_runs[0]] = (1, 2, 0)
@@ -278,7 +278,7 @@ def test_numbers_of_a_figure_by_hand(tmp_path):
     assert first["ratio"] == 1
 
 
-def test_without_the_first_system_there_is_nothing_to_compare_with(tmp_path):
+def test_nothing_is_compared_without_the_first_system(tmp_path):
     (run,) = runs("k-1", 1)
     write(tmp_path, run, [1, 2, 3])
     (record,) = summarise("ensemble-size", [run], tmp_path)
@@ -328,7 +328,7 @@ def test_every_figure_is_drawn_from_what_there_is(tmp_path, name):
     assert (tmp_path / "some.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_publishing_says_what_is_missing_and_shows_all_seeds_there_are(tmp_path):
+def test_publishing_names_what_is_missing_and_shows_every_seed(tmp_path):
     a, b, c = runs("me-trpo", 3)
     write(tmp_path, a, [0, 1, 2])
     write(tmp_path, c, [0, 3])

@@ -124,7 +124,7 @@ def test_baseline_is_ridge_regression_on_the_steps_that_count(seed, ridge):
     np.testing.assert_allclose((feature @ weights)[mask > 0], (feature @ slow)[mask > 0], atol=0.05 + 0.01 * residual)
 
 
-def test_baseline_recovers_values_that_are_linear_in_its_features():
+def test_the_baseline_recovers_values_linear_in_its_features():
     rng = np.random.default_rng(0)
     states = rng.normal(size=(100, 50, S)).astype(np.float32)
     feature = np.asarray(features(states), np.float64)

@@ -61,7 +61,7 @@ def test_kl_is_the_integral_of_its_definition(old_means, old_log_std, means, log
     assert got >= -1e-5
 
 
-def test_kl_of_a_policy_with_itself_is_zero_and_of_others_is_not_symmetric():
+def test_kl_with_itself_is_zero_and_with_others_not_symmetric():
     zero, one = np.zeros(2, np.float32), np.ones(2, np.float32)
     assert kl(one, one, one, one) == 0
     # N(0, 1) against N(0, e^2) in two dimensions: log(sigma) + 1 / (2 sigma^2) - 1/2 each
@@ -69,7 +69,7 @@ def test_kl_of_a_policy_with_itself_is_zero_and_of_others_is_not_symmetric():
     assert kl(zero, one, zero, zero) == pytest.approx(2 * (-1 + np.exp(2) / 2 - 0.5), rel=1e-5)
 
 
-def test_samples_have_the_mean_and_the_standard_deviation_of_the_policy():
+def test_samples_have_the_policys_mean_and_standard_deviation():
     policy = random_policy(5)
     states = np.random.default_rng(0).normal(size=(1, 4)).astype(np.float32).repeat(20_000, axis=0)
     z = (np.asarray(gaussian.sample(policy, states, jax.random.key(0))) - slow_mean(policy, states[0])) / np.exp(

@@ -310,7 +310,7 @@ def test_a_chart_puts_points_where_they_belong():
     assert [number(v) for v in (0.01234, 3.0, 1735.2, 2.5e6, math.nan)] == ["0.0123", "3", "1,735", "2.5M", "-"]
 
 
-def test_the_curve_of_a_run_without_an_environment_has_no_real_return(tmp_path, monkeypatch):
+def test_a_curve_without_an_environment_has_no_real_return(tmp_path, monkeypatch):
     from matplotlib.figure import Figure
 
     draw_curve(healthy(2), tmp_path / "curve.png", r"a $\task$, which is no formula")

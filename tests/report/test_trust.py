@@ -91,7 +91,7 @@ def test_no_range_is_too_odd_for_a_logarithmic_axis(y):
     assert not re.search(r"\b(nan|inf)\b", made)
 
 
-def test_the_heat_map_shows_which_dimension_and_after_how_many_steps(tmp_path):
+def test_the_heat_map_shows_dimensions_against_steps(tmp_path):
     made = picture(drawn(tmp_path / "a"), "Model error by state dimension")
     assert "largest 1.7, of dimension 2 after an imagined episode; 1 of 12 above 1" in made
     assert re.findall(r'"end"[^>]*>([^<]*)<', made) == ["s[0]", "s[1]", "s[2]", "s[3]"]
@@ -154,7 +154,7 @@ def test_one_model_has_nobody_to_disagree_with(tmp_path):
     assert "Model error by dimension" in text
 
 
-def test_a_damaged_file_of_diagnostics_is_named_and_the_run_stays(tmp_path):
+def test_a_damaged_diagnostics_file_is_named_and_the_run_stays(tmp_path):
     good = to_csv(details())
     for i, text in enumerate(
         (good[: len(good) // 2], "", good.replace("\n3,", "\n2,"), "\0", good.replace("0.8", "x"), good[:-2])

@@ -174,7 +174,7 @@ def test_three_differences_are_named_and_the_others_counted(tmp_path, wrong, mor
     assert "use that version" not in str(error.value), "this version wrote it"
 
 
-def test_a_task_of_another_size_is_named_as_such_and_not_as_another_version(tmp_path):
+def test_a_task_of_another_size_is_no_other_version(tmp_path):
     path = tmp_path / "a.npz"
     save_state(path, {"x": np.zeros((2, 3), np.float32), "y": jnp.zeros(4)}, {})
     with pytest.raises(RunDirectoryError, match="task's observations or actions have another size now") as error:

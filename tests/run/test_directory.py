@@ -149,7 +149,7 @@ print(deadline)
 """
 
 
-def test_kill_at_any_write_then_resume_equals_an_uninterrupted_run(tmp_path):
+def test_a_run_killed_at_any_write_resumes_as_if_uninterrupted(tmp_path):
     command = [sys.executable, "-c", KILLER, str(SUPPORT), str(tmp_path)]
     survived = int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
     assert survived > 30
@@ -269,7 +269,7 @@ def test_training_says_where_a_run_is_taken_up(tmp_path, monkeypatch, budget, ex
     assert again.heard == [(str(tmp_path), 3, expected, a_state(2).real_steps)]
 
 
-def test_a_finished_run_started_again_writes_what_is_missing_or_damaged(tmp_path, monkeypatch):
+def test_a_finished_run_rewrites_what_is_missing_or_damaged(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "draw_curve", lambda rows, path, *_: path.write_text(f"{len(rows)} rows"))
     train(tmp_path, until=2)
 

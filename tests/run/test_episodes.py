@@ -71,7 +71,7 @@ def test_every_episode_is_learned_from_once(tmp_path_factory, deeds):
     same(given_out, learned + mine.pending())
 
 
-def test_an_episode_that_comes_while_the_policy_improves_waits_for_the_next_iteration(tmp_path):
+def test_an_episode_during_improvement_waits_for_the_next(tmp_path):
     log, (first, second) = EpisodeLog(tmp_path), episodes(2)
     log.append(first)
     same([first], log.pending())

@@ -100,7 +100,7 @@ def test_actions_are_clipped(ending, tmp_path):
     assert (actions.min(), actions.max()) == (-1, 1)
 
 
-def test_python_takes_single_observations_and_says_which_shapes_it_takes(tmp_path):
+def test_python_takes_single_observations_and_names_its_shapes(tmp_path):
     saved(tmp_path)
     act = python(export(tmp_path)).act
     observations = np.random.default_rng(0).standard_normal((5, S))
@@ -145,7 +145,7 @@ TO_ENV = {".py": lambda path: python(path).to_env, ".npz": lambda path: load_pol
     ("low", "high", "dtype"),
     [((-2.0, -0.5, 1.0), (2.0, 3.0, 5.0), np.float32), ((-2.7, 0.1, -1e9), (2.4, 0.3, 1e9), np.float64)],
 )
-def test_actions_in_the_environments_units_are_those_of_the_wrapper(ending, low, high, dtype, tmp_path):
+def test_actions_in_real_units_are_those_of_the_wrapper(ending, low, high, dtype, tmp_path):
     saved(tmp_path, interface=Interface(((S, "all"),), low, high))
     to_env = TO_ENV[ending](export(tmp_path, tmp_path / f"exported{ending}"))
     actions = np.array([[-1, -1, -1], [1, 1, 1], [0, 0, 0], [0.25, -0.5, 2], [-7, 0.999, 1]], np.float32)
@@ -176,7 +176,7 @@ def test_a_policy_of_old_acts_and_says_that_it_knows_no_range(ending, ordinary, 
         assert "not known: scale the actions yourself" in python(path).__doc__
 
 
-def test_a_policy_of_old_for_a_known_task_is_exported_with_its_range(tmp_path):
+def test_a_known_tasks_old_policy_is_exported_with_its_range(tmp_path):
     save_policy(tmp_path, random_policy(0, 3, 1), "Pendulum-v1", 1, 1000, 1.0)  # without its interface, as before
     assert python(export(tmp_path)).control(np.zeros(3)).shape == (1,)
     save_policy(tmp_path, random_policy(0, 3, 1), f"{tmp_path}/evil.py:make", 1, 1000, 1.0)
@@ -184,7 +184,7 @@ def test_a_policy_of_old_for_a_known_task_is_exported_with_its_range(tmp_path):
     assert python(export(tmp_path)).ACTION_LOW is None
 
 
-def test_an_exported_policy_of_a_walker_plays_the_plain_environment(tmp_path):
+def test_a_walkers_exported_policy_plays_the_plain_environment(tmp_path):
     """From what its file says alone: which number to put in front, and in which units to act."""
     task = get_task("HalfCheetah-v5")
     policy = random_policy(0, 18, 6)
@@ -476,7 +476,7 @@ def test_a_directory_in_the_way_is_named(tmp_path):
         ("007", "my_policy"),
     ],
 )
-def test_a_name_that_python_cannot_import_is_refused_with_a_better_one(name, better, tmp_path):
+def test_an_unimportable_name_is_refused_with_a_better_one(name, better, tmp_path):
     saved(tmp_path)
     with pytest.raises(MetrpoError, match=rf"can import, such as {better}\.py, got {name}\.py"):
         export(tmp_path, tmp_path / f"{name}.py")

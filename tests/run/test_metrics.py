@@ -96,7 +96,7 @@ def test_a_curve_is_drawn_whatever_the_numbers(tmp_path, rows):
     assert [p.name for p in tmp_path.iterdir()] == ["curve.png"]
 
 
-def test_imagined_points_lie_within_the_axis_where_no_evaluation_succeeded(monkeypatch, tmp_path):
+def test_imagined_points_stay_on_the_axis_without_evaluations(monkeypatch, tmp_path):
     limits, drawn = [], curve._draw_returns
     monkeypatch.setattr(
         curve, "_draw_returns", lambda axes, *rest: (drawn(axes, *rest), limits.append(axes.get_ylim()))

@@ -110,7 +110,7 @@ def test_a_damaged_policy_is_refused(loaded, tmp_path):
     assert "\\x" not in str(error.value), "no raw bytes"
 
 
-def test_a_folder_of_runs_names_one_and_does_not_ask_to_train_into_it(loaded, tmp_path):
+def test_a_folder_of_runs_is_refused_with_the_name_of_one(loaded, tmp_path):
     (tmp_path / "runs").mkdir()
     os.rename(tmp_path / "policy.npz", tmp_path / "runs" / "policy.npz")
     with pytest.raises(RunDirectoryError, match=rf"name one of them, such as {tmp_path}/runs$") as error:

@@ -128,7 +128,7 @@ def evaluated(capsys, *arguments):
     return code, json.loads(out)["task"] if out else err
 
 
-def test_a_run_is_evaluated_from_another_folder_and_after_its_file_moved(tmp_path, monkeypatch, capsys):
+def test_a_run_is_evaluated_elsewhere_and_after_its_file_moved(tmp_path, monkeypatch, capsys):
     write("there/mine.py", MAKE, horizon=5)
     monkeypatch.chdir("there")
     a_run(tmp_path / "run", "mine.py:make")
@@ -153,7 +153,7 @@ def forgotten(monkeypatch, *names):
         del sys.modules[name]
 
 
-def test_a_run_of_a_module_is_evaluated_from_another_folder_and_after_it_moved(tmp_path, monkeypatch, capsys):
+def test_a_modules_run_is_evaluated_elsewhere_and_after_it_moved(tmp_path, monkeypatch, capsys):
     Path("there/parts").mkdir()
     write("there/parts/__init__.py", "LENGTH = 5\n")
     write("there/parts/mine.py", "from . import LENGTH\n" + textwrap.dedent(MAKE).format(horizon="LENGTH"))
@@ -233,7 +233,7 @@ def test_the_error_names_the_task_that_was_tried(command, capsys):
 
 
 @pytest.mark.parametrize("command", ["train", "init"])
-def test_a_new_run_is_not_told_of_an_option_that_its_command_lacks(command, capsys):
+def test_a_new_run_hears_of_no_option_its_command_lacks(command, capsys):
     assert main.main([command, "nofile.py:task"]) == 2
     said = capsys.readouterr().err
     assert "nofile.py:task: expected a Python file at " in said

@@ -76,7 +76,7 @@ def fake(monkeypatch):
     # The first finds the caches cold; what is longer than a turn is done once.
     [([0.5, 0.25, 0.125, 0.375], 0.25, 4), ([1.2], 1.2, 1), ([0.9, 0.2], 0.2, 2)],
 )
-def test_short_work_is_repeated_and_its_first_repetition_not_counted(takes, expected, repetitions, monkeypatch):
+def test_short_work_is_repeated_and_the_first_time_not_counted(takes, expected, repetitions, monkeypatch):
     clock, done = [0.0], []
     monkeypatch.setattr(measure.time, "perf_counter", lambda: clock[0])
 
@@ -125,7 +125,7 @@ def test_real_work_runs_and_takes_time(name):
 
 
 @pytest.mark.slow
-def test_whole_iterations_are_timed_and_their_compilations_counted(monkeypatch):
+def test_iterations_are_timed_and_their_compilations_counted(monkeypatch):
     small = {
         "iterations": 3,
         "collect.steps": 200,

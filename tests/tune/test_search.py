@@ -282,7 +282,7 @@ def test_halving_prunes_too(tmp_path):
     assert {r.state for r in found.records} == {"complete", "pruned"}
 
 
-def test_a_trial_is_worth_the_mean_of_its_seeds_which_run_side_by_side(tmp_path):
+def test_a_trial_is_worth_the_mean_of_its_parallel_seeds(tmp_path):
     fake = Fake()
     found = tune(search(2, seeds=(0, 1)), tmp_path, 1, silent, fake)
     first = found.records[0]
@@ -325,7 +325,7 @@ class Journal:
         patch.setattr(tuning._Tuning, "_stop_all", lambda self: None)
 
 
-def test_killed_in_any_line_of_the_journal_the_same_trials_come_out(tmp_path, monkeypatch):
+def test_killed_in_any_journal_line_the_same_trials_come_out(tmp_path, monkeypatch):
     whole = Fake()
     with monkeypatch.context() as patch:
         journal = Journal(patch, None)
@@ -448,7 +448,7 @@ def faked(monkeypatch):
     signal.signal(signal.SIGTERM, before)
 
 
-def test_the_command_ends_with_a_table_a_picture_and_the_best_command(tmp_path, faked, capsys, monkeypatch):
+def test_tune_ends_with_a_table_a_picture_and_the_best_command(tmp_path, faked, capsys, monkeypatch):
     assert main.main(command(tmp_path)) == 0
     said = capsys.readouterr().out
     assert "6 trials: " in said
@@ -522,7 +522,7 @@ with hold(Path(sys.argv[1])):
 """
 
 
-def test_a_run_that_survived_its_tune_is_watched_stopped_and_taken_over(tmp_path, monkeypatch):
+def test_a_run_that_outlived_its_tune_is_stopped_and_taken_over(tmp_path, monkeypatch):
     (run,) = search().runs(0, {"trpo.max_kl": 0.1})
     directory, started = tmp_path / run.name, []
     directory.mkdir(parents=True)
@@ -556,7 +556,7 @@ def test_a_run_that_survived_its_tune_is_watched_stopped_and_taken_over(tmp_path
 
 @pytest.mark.timeout(600)  # seconds on a free core; a machine that does other work needs longer
 @pytest.mark.slow
-def test_killed_together_with_its_run_it_goes_on_from_the_checkpoint(tmp_path):
+def test_killed_with_its_run_tune_goes_on_from_the_checkpoint(tmp_path):
     out = tmp_path / "out"
     fixed = {name: value for name, value in SMALL.items() if name != "iterations"}
     file = tmp_path / "search.toml"

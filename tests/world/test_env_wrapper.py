@@ -224,7 +224,7 @@ def test_an_observation_that_is_no_state_is_one_error(observation):
         real.evaluate(plain, lambda state: np.zeros(1), 1, seed=0)
 
 
-def test_an_exception_of_an_environment_that_comes_as_it_is_is_one_error():
+def test_any_exception_of_an_environment_is_one_error():
     class Off(Env):
         def step(self, action):
             raise ValueError("motor 3 is off")
@@ -264,7 +264,7 @@ def _failing(state):
     raise ValueError("policy failed")
 
 
-def test_an_episode_ends_at_the_tasks_horizon_whatever_the_environment_says():
+def test_an_episode_ends_at_the_tasks_horizon_in_any_environment():
     endless = Task("Mine", None, 1, 1, 7, None, make=lambda **_: Env())
     assert real.evaluate(endless, lambda state: np.zeros(1), 2, seed=0).tolist() == [7, 7]
 

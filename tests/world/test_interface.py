@@ -60,7 +60,7 @@ def test_the_humanoid_shows_what_it_says():
     env.close()
 
 
-def test_parts_of_dicts_and_tuples_are_named_in_the_order_of_the_state():
+def test_parts_of_dicts_and_tuples_are_named_in_state_order():
     class Nested(gymnasium.Env):
         observation_space = Dict({"b": Box(0, 1, (2, 2)), "a": Tuple([Box(0, 1, (1,)), Box(0, 1, (3,))])})
         action_space = Box(np.array([-1, 0], np.float32), np.array([1, 5], np.float32))

@@ -64,7 +64,7 @@ def _here(tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
 
 
-def test_episodes_come_as_they_were_played_with_actions_in_our_range():
+def test_episodes_come_as_played_with_actions_in_our_range():
     recorder = Recorder(gymnasium.make("Pendulum-v1")).play(seed=1).play(seed=2)
     recorder.save("pendulum/random-v0")
     task = get_task("Pendulum-v1")
@@ -100,7 +100,7 @@ class Ending(gymnasium.Env):
         return self.seen(action), 1.0, self.age == 3, False, {}
 
 
-def test_observations_of_several_parts_are_flattened_as_in_training():
+def test_observations_of_parts_are_flattened_as_in_training():
     recorder = Recorder(Ending()).play(seed=0)
     recorder.save("ending/random-v0")
     task = task_of(Ending, horizon=10)

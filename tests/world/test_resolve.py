@@ -84,7 +84,7 @@ def test_dicts_and_tuples_are_flattened():
     assert state.dtype == np.float64
 
 
-def test_the_horizon_is_the_environments_time_limit_or_the_one_given():
+def test_the_horizon_is_the_time_limit_or_the_one_given():
     limited = task_of(lambda **kw: gymnasium.wrappers.TimeLimit(Env(**kw), 7), name="limited")
     assert (limited.horizon, limited.state_size, limited.action_size) == (7, 3, 2)
     assert limited.learned == ("reward", "end")

@@ -79,7 +79,7 @@ def test_a_run_measures_them_once_keeps_and_says_them(tmp_path):
     assert about["yardsticks"]["zero"]["episodes"] == 10
 
 
-def test_a_run_killed_before_its_first_checkpoint_says_so_and_measures_nothing_again(tmp_path):
+def test_a_run_killed_before_its_first_checkpoint_measures_once(tmp_path):
     first, again, other = Heard(), Heard(), Heard()
     training.train(CONFIG, tmp_path, first)
     assert not [line for line in first.lines if "resuming" in line]

@@ -34,7 +34,7 @@ SHARED = dataclasses.replace(MEANS, storage="shared")
 # ---------------------------------------------------------------- options and table
 
 
-def test_every_backend_stands_in_the_table_with_the_same_signature():
+def test_every_backend_in_the_table_has_the_same_signature():
     assert set(BACKENDS) == set(get_args(Backend))
     assert len({str(inspect.signature(function)) for function in BACKENDS.values()}) == 1
 
@@ -199,7 +199,7 @@ def test_what_is_asked_of_machines_that_share_no_disk(on, monkeypatch, tmp_path)
     assert (order.directory, name, store) == (str(tmp_path / name), RUNS[2].name, f"the store of {tmp_path}")
 
 
-def test_a_run_that_fails_stops_no_other_and_is_told_with_the_reason(on, tmp_path):
+def test_a_failed_run_stops_no_other_and_its_reason_is_shown(on, tmp_path):
     log = tmp_path / f"{RUNS[0].name}.log"
     log.parent.mkdir(parents=True)
     log.write_text("what went wrong\n")

@@ -113,7 +113,7 @@ def test_a_run_that_another_process_holds_is_not_given_away(kept, out):
 
 
 @pytest.mark.parametrize("name", ["../x", "/tmp/x", "a/../../x", "a//x", "", ".", ".lock", "episodes/.tmp", "a\0b"])
-def test_names_outside_of_the_run_directory_are_refused_and_nothing_is_written(kept, out, name):
+def test_names_outside_of_the_run_directory_are_refused(kept, out, name):
     attempt, _ = kept.begin(RUN)
     before = there(out)
     for wrong in (changes([("run.json", b""), (name, b"")], log=b"words"), changes([("run.json", b"")], [name])):
@@ -321,7 +321,7 @@ def test_a_run_whose_files_are_not_taken_is_killed(monkeypatch):
     assert process.returncode == -9
 
 
-def test_the_last_look_is_after_the_end_and_made_again_when_it_is_interrupted():
+def test_the_last_look_follows_the_end_and_survives_interruption():
     process = subprocess.Popen([sys.executable, "-c", "pass"])
     process.wait()
     left, looked = [KeyboardInterrupt], []

@@ -110,7 +110,7 @@ def test_ascend_is_adam_uphill():
     np.testing.assert_allclose(flat(new), expected, atol=1e-6)
 
 
-def test_a_long_gradient_is_shortened_to_its_bound_and_a_short_one_is_not():
+def test_only_a_long_gradient_is_shortened_to_its_bound():
     """The first step of Adam hardly knows the length; its moments and the second step do."""
     policy, config = random_policy(0, 2, 1, ()), GradientConfig(learning_rate=0.02, max_norm=2.0)
     one, other = (flat(random_policy(n, 2, 1, ())) for n in (1, 2))
@@ -277,7 +277,7 @@ def through(act, ensemble, policy, starts, horizon, config=UNCLIPPED, reward=pro
 # with 64 bits, model_choice puts int64 model numbers, all below K, into an int32 array
 @pytest.mark.parametrize("members", [1, 3])
 @pytest.mark.parametrize("act", [bptt.deterministic, bptt.stochastic])
-def test_the_gradient_through_the_models_is_that_of_finite_differences(act, members):
+def test_bptts_gradient_is_that_of_finite_differences(act, members):
     policy, ensemble = random_policy(2, 2, 2, (3,), scale=0.5, std=0.3), random_ensemble(1, members, 2, 2, scale=0.3)
     starts, horizon = np.random.default_rng(3).uniform(-0.7, 0.7, (4, 2)), 5
     with jax.enable_x64(True):
@@ -331,7 +331,7 @@ def test_the_gradient_through_a_linear_system_is_the_closed_form(members):
     assert info.kl > 0
 
 
-def test_exploding_rollouts_count_nothing_and_a_model_of_nan_moves_nothing():
+def test_exploding_rollouts_and_a_model_of_nan_move_nothing():
     """From 10,000 a tenfold growth passes the limit of 1e6; from 0.01 it does not; no action is clipped."""
     policy = Policy(((np.array([[1e-5]], np.float32), np.zeros(1, np.float32)),), np.zeros(1, np.float32))
     ensemble = linear_ensemble([(np.array([[10.0]]), np.array([[1.0]]))])

@@ -39,7 +39,7 @@ def test_chunks_hold_the_batch_features_first_and_nothing_else(count, chunks, si
 
 @pytest.mark.parametrize("hidden", [(), (5,), (5, 3), (5, 3, 4)])
 @pytest.mark.parametrize("count", [7, 31])
-def test_means_and_both_products_are_those_of_automatic_differentiation(hidden, count):
+def test_means_and_products_are_those_of_autodiff(hidden, count):
     policy, states, outputs = setting(hidden, count)
 
     def means(layers):

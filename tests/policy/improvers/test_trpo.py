@@ -108,7 +108,7 @@ def test_conjugate_gradient_solves(size, spread):
 
 
 @pytest.mark.parametrize("iterations", [1, 3, 8])
-def test_an_unfinished_conjugate_gradient_knows_its_residual_and_curvature(iterations):
+def test_an_unfinished_cg_knows_its_residual_and_curvature(iterations):
     matrix, target = a_system(3, 20, 1000.0)
     x, residual = conjugate_gradient(matrix, target, iterations)
     x, residual = x.astype(float), residual.astype(float)

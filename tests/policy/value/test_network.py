@@ -183,7 +183,7 @@ def test_learning_goes_on_from_fit_to_fit_and_depends_on_its_key():
 
 
 @pytest.mark.parametrize("cut", [False, True])
-def test_each_batch_is_judged_by_the_network_as_it_was_and_teaches_its_lambda_returns(cut):
+def test_a_batch_is_judged_by_the_network_before_it_teaches_it(cut):
     rng, batch = np.random.default_rng(0), a_batch(1)
     mask = (np.arange(T)[:, None] < rng.integers(0, 2 * T, E)).astype(np.float32)
     batch = batch._replace(mask=mask, going_on=mask[-1] * (rng.uniform(size=E) < 0.7).astype(np.float32))
@@ -238,7 +238,7 @@ M = probe.A - K * probe.B
 """The probe under the policy a = -K s."""
 
 
-def test_the_value_of_a_linear_system_is_learned_from_its_first_steps():
+def test_a_linear_systems_value_is_learned_from_first_steps():
     """Of the value -s' P s, P = M'M + K^2 I + discount M'PM, a fourth lies behind the cut."""
     p = np.zeros((2, 2))
     for _ in range(1000):

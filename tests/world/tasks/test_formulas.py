@@ -117,7 +117,7 @@ def test_sizes_and_horizon(name):
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if SIZES[name][3]])
-def test_the_unseen_are_the_global_positions_and_nothing_else_feels_them(name):
+def test_the_unseen_are_global_positions_that_nothing_feels(name):
     """A robot moved far away moves on alike: neither its state elsewhere nor its reward changes."""
     known, results = KNOWN[name], []
     unseen = list(known.unseen)
@@ -216,7 +216,7 @@ def _triple(name):
 
 
 @pytest.mark.parametrize("name", HEALTHY)
-def test_health_is_that_of_the_environment_in_states_of_every_kind(name):
+def test_health_is_the_environments_in_states_of_every_kind(name):
     """States drawn far beyond every threshold, each side of each of which is visited."""
     env, rng, expected, got = KNOWN[name].make().unwrapped, np.random.default_rng(0), [], []
     env.reset(seed=0)
@@ -269,7 +269,7 @@ def test_the_mountain_car_is_there_only_forwards(position, velocity, there):
     assert reward == pytest.approx(100 * there - 0.025)
 
 
-def test_pendulum_reads_the_angle_before_the_step_on_either_side_of_the_bottom():
+def test_pendulum_reads_the_angle_before_the_step_on_either_side():
     env = rescaled("Pendulum-v1")
     for angle in (-3 * np.pi, -3.2, -3.1, 0.0, 0.4, 3.1, 3.2, 7.0):
         env.reset(seed=0)
@@ -317,7 +317,7 @@ def test_all_but_the_distance_is_exact(name):
         state = env.reset()[0] if terminated else next_state
 
 
-def test_the_humanoids_torso_is_gymnasiums_and_its_centre_of_mass_is_found():
+def test_the_humanoids_torso_and_centre_of_mass_are_gymnasiums():
     env = KNOWN["Humanoid-v5"].make().unwrapped
     torso = env.model.body("torso")
     assert _TORSO["mass"] == pytest.approx(torso.mass[0], rel=1e-12)
@@ -407,7 +407,7 @@ def test_rewards_and_states_against_mujocos_own_numbers(name):
             np.testing.assert_allclose(state, expected, atol=1e-7)
 
 
-def test_the_swimmer_is_gymnasiums_with_a_tip_and_touches_nothing():
+def test_the_swimmer_is_gymnasiums_with_a_tip_without_contacts():
     env = KNOWN["mbbl/Swimmer"].make().unwrapped
     model = env.model
     assert (model.opt.timestep, env.frame_skip, model.opt.integrator) == (0.01, 4, mujoco.mjtIntegrator.mjINT_RK4)
@@ -472,7 +472,7 @@ def test_a_pendulum_hanging_still_gets_200():
     assert env.step(np.zeros(1, np.float32))[1] == pytest.approx(-1.0)  # upright, Gym's goal, is the worst place
 
 
-def test_the_pendulum_moves_as_gyms_and_turns_by_its_speed_before_the_limit():
+def test_the_pendulum_is_gyms_and_turns_by_its_unlimited_speed():
     ours, gyms = KNOWN["mbbl/Pendulum"].make().unwrapped, KNOWN["Pendulum-v1"].make().unwrapped
     rng = np.random.default_rng(0)
     for _ in range(200):

@@ -132,7 +132,7 @@ def test_physics(name):
 
 
 @pytest.mark.parametrize(("name", "links"), [("Swimmer", 3), ("Snake", 5)])
-def test_the_swimmers_are_chains_of_equal_capsules_without_armature(name, links):
+def test_swimmers_are_chains_of_equal_capsules_without_armature(name, links):
     model = make(name).model
     assert (model.nbody, model.ngeom) == (links + 1, links + 1)
     assert (model.nq, model.nv, model.nu) == (links + 2, links + 2, links - 1)
@@ -395,7 +395,7 @@ def test_a_still_swimmer_goes_nowhere(name, motors):
     assert swim(make(name), lambda step: np.zeros(motors), at_rest=True) == pytest.approx(0, abs=1e-9)
 
 
-def test_a_swimmer_coasts_on_the_noise_of_its_start_to_either_side():
+def test_a_swimmer_coasts_on_its_starts_noise_to_either_side():
     env = make("Swimmer")
     returns = [swim(env, lambda step: np.zeros(2), seed) for seed in range(40)]
     assert abs(np.mean(returns)) < 3.0
