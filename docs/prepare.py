@@ -139,11 +139,11 @@ def check() -> Links:
 
 def commands() -> str:
     """All commands in short, and a section for each: what --help-all prints, without its boxes."""
-    from metrpo.commands import options
     from metrpo.commands.help import overview
+    from metrpo.commands.parse import parse
+    from metrpo.commands.table import NAMES
 
-    names = [command.__name__.lower() for command in typing.get_args(options.Command)]
-    sections = (_command(name, _help(options.parse, name)) for name in names)
+    sections = (_command(name, _help(parse, name)) for name in NAMES)
     return "\n".join([f"```text\n{overview()}\n```\n", *sections])
 
 

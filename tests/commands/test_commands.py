@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,10 +17,10 @@ import numpy as np
 import pytest
 
 import metrpo
-from metrpo.commands import main as commands
 from metrpo.commands.default_dir import default_run_dir
 from metrpo.commands.main import main
-from metrpo.commands.options import COMMANDS, parse
+from metrpo.commands.parse import parse
+from metrpo.commands.table import NAMES
 from metrpo.config import Config
 from metrpo.launch.run_spec import RunSpec
 from metrpo.presets import preset
@@ -144,7 +145,8 @@ def test_the_default_directory_follows_from_the_settings(capsys):
     ],
 )
 def test_the_default_directory_is_named_after_what_is_changed(options, name):
-    config, path = commands._run(parse(["train", "Swimmer", *options]))
+    options = parse(["train", "Swimmer", *options])
+    config, path = options.config, options.directory
     assert (path.name == f"Swimmer-fast-seed0{name}") or path.name == name or "settings" in name
     if "settings" in name:
         assert re.fullmatch(r"Swimmer-fast-seed1-4-settings-[0-9a-f]{8}", path.name)
@@ -346,7 +348,7 @@ def test_doctor_finds_what_is_here_and_what_is_missing(capsys, monkeypatch):
     assert "training cannot work here" in out
 
 
-@pytest.mark.parametrize("command", ["", *COMMANDS])
+@pytest.mark.parametrize("command", ["", *NAMES])
 def test_every_help_has_examples(capsys, command):
     assert run(*command.split(), "--help") == 0
     out = capsys.readouterr().out
@@ -362,7 +364,41 @@ def test_the_list_of_commands_fits_a_screen_and_names_all(capsys):
     assert len(lines) <= 24
     assert max(map(len, lines)) <= 80
     rows = [line for line in lines[1:] if line[13:14] == " " and line[14:15].isalpha()]
-    assert sorted(line[14:].split()[0] for line in rows) == sorted(COMMANDS)
+    assert sorted(line[14:].split()[0] for line in rows) == sorted(NAMES)
+
+
+def test_a_new_command_is_one_file_and_one_row(tmp_path):
+    """In a scratch copy of the package: nothing else has to know of it."""
+    package = tmp_path / "metrpo"
+    shutil.copytree(Path(metrpo.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    (package / "commands" / "greet.py").write_text(GREET)
+    table = package / "commands" / "table.py"
+    table.write_text(table.read_text().replace('        "doctor":', '        "greet": "Say hello",\n        "doctor":'))
+
+    def run_there(*words: str) -> str:
+        environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+        command = [sys.executable, "-m", "metrpo", *words]
+        return subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
+
+    assert "greet      Say hello" in run_there("--help")
+    assert run_there("greet", "you") == "hello you\n"
+
+
+GREET = """
+from dataclasses import dataclass
+
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class Greet:
+    whom: Positional[str]
+
+
+def run(command):
+    print(f"hello {command.whom}")
+    return 0
+"""
 
 
 def options_in(text):
@@ -412,11 +448,11 @@ def test_the_command_of_a_run_sets_what_is_on_or_off():
     """Sweeps and searches give it to `metrpo train`."""
     for value, preset_ in ((True, "paper"), (False, "fast")):
         changed = RunSpec("Swimmer", "me-trpo", 0, (("policy.normalise", value), ("deterministic", True)), preset_, "")
-        config, _ = commands._run(parse(["train", *changed.arguments]))
+        config = parse(["train", *changed.arguments]).config
         assert config == changed.config
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize("command", NAMES)
 def test_help_has_no_empty_default_and_no_words_of_the_parser(capsys, command):
     assert run(command, "--help-all") == 0
     text = capsys.readouterr().out

@@ -83,11 +83,12 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[1])
 import probe
 from metrpo.commands import main
+from metrpo.commands.train import say_outcome
 with probe.registered():
     for command in (["--help"], ["evaluate", sys.argv[2], "--episodes", "1"], ["watch", sys.argv[2], "--once"]):
         assert main.main(command) == 0, command
         print("=====")
-    main._report(Path(sys.argv[2]), video=False)  # what a finished run says
+    say_outcome(Path(sys.argv[2]), video=False)  # what a finished run says
 """
 
 

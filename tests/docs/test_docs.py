@@ -14,7 +14,6 @@ import runpy
 import shutil
 import sys
 import tomllib
-import typing
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,8 @@ import pytest
 import metrpo
 import probe
 from metrpo import config, presets
-from metrpo.commands import main, options
+from metrpo.commands import main, parse, table
+from metrpo.commands.reproduce import Reproduce
 from metrpo.errors import TaskError
 from metrpo.run import machine
 from pages import PAGES, ROOT, SHELL, Block, blocks, mentioned, typed
@@ -106,14 +106,14 @@ def wrong(words: list[str]) -> str:
     if len(words) == 1 and words[0] in known():  # a command that is spoken of
         return ""
     try:
-        command = options.parse(words)
+        command = parse.parse(words)
     except SystemExit as end:
         return "" if end.code in (0, None) else f"the parser ends with {end.code}"
     except TaskError as error:  # Shimmy is not among what the tests need
         return "" if words[1].startswith("dm_control/") and "metrpo[dm-control]" in str(error) else str(error)
     except metrpo.MetrpoError as error:
         return str(error)
-    if isinstance(command, options.Reproduce):
+    if isinstance(command, Reproduce):
         from metrpo.paper.figures import FIGURES
 
         return "" if command.figure in {"all", *FIGURES} else f"no figure {command.figure}"
@@ -133,7 +133,7 @@ def test_commands_are_found():
 
 
 def known() -> set[str]:
-    return {command.__name__.lower() for command in typing.get_args(options.Command)}
+    return set(table.NAMES)
 
 
 @pytest.mark.parametrize(
@@ -175,9 +175,7 @@ def test_the_reference_is_complete():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"].keys() - {"dev"}
     assert set(re.findall(r"^\| `([a-z-]+)` \|", (ROOT / "docs" / "index.md").read_text(), re.MULTILINE)) == extras
     text = prepare["commands"]()
-    assert re.findall(r"^## metrpo (\w+)$", text, re.MULTILINE) == [
-        command.__name__.lower() for command in typing.get_args(options.Command)
-    ]
+    assert re.findall(r"^## metrpo (\w+)$", text, re.MULTILINE) == list(table.NAMES)
     assert "--ensemble.members INT" in text
     assert not set(text) & set("╭╮╰╯│")
 

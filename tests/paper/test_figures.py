@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from metrpo.commands import options
+from metrpo.commands import parse
 from metrpo.config import Config, to_json
 from metrpo.errors import ConfigError
 from metrpo.launch import dispatch as running
@@ -113,7 +113,7 @@ def test_the_command_of_a_run_is_its_config(scale, monkeypatch):
     runs = runs_of("all", scale, seeds=1)
     settings = {(run.system, run.preset, run.overrides): run for run in runs}
     for run in {run.name: run for run in [*settings.values(), *{run.task: run for run in runs}.values()]}.values():
-        parsed = options.parse(["train", *run.arguments])
+        parsed = parse.parse(["train", *run.arguments])
         assert Config(**{f.name: getattr(parsed, f.name) for f in dataclasses.fields(Config)}) == run.config
 
 
@@ -151,12 +151,12 @@ def test_only_what_is_missing_is_run(tmp_path, trained):
     first, second, third = runs("k-1", 3)
     write(tmp_path, first, [1, 2, 3])
     write(tmp_path, second, [1, 2])
-    assert running.reproduce([first, second, third], tmp_path, Means(jobs=2), told.append) == []
+    assert running.dispatch([first, second, third], tmp_path, Means(jobs=2), told.append) == []
     assert begun == [second, third]
     assert told[:2] == ["1 of 3 runs are finished; 2 to go", "2 at a time on this machine"]
     assert sum("return 1.5" in line for line in told) == 2
     begun.clear()
-    assert running.reproduce([first, second, third], tmp_path, Means(jobs=2), told.append) == []
+    assert running.dispatch([first, second, third], tmp_path, Means(jobs=2), told.append) == []
     assert begun == []
 
 
@@ -166,7 +166,7 @@ def test_a_failed_run_stops_no_other_and_leaves_last_words(tmp_path, trained):
     outcomes[all_runs[0]] = (1, 2, 0)
     outcomes[all_runs[1]] = (2, 0, 0)  # ends without an error, but short of its budget
     told = []
-    assert set(running.reproduce(all_runs, tmp_path, Means(jobs=1), told.append)) == set(all_runs[:2])
+    assert set(running.dispatch(all_runs, tmp_path, Means(jobs=1), told.append)) == set(all_runs[:2])
     assert begun == all_runs
     text = "\n".join(told)
     assert "Swimmer/k-1/seed-0: FAILED" in text
@@ -199,7 +199,7 @@ def test_as_many_at_a_time_as_jobs(tmp_path, monkeypatch):
 
     monkeypatch.setattr(local, "_command", command)
     monkeypatch.setattr(local, "_POLL", 0.02)
-    assert running.reproduce(pair, tmp_path, Means(jobs=2), lambda line: None) == []
+    assert running.dispatch(pair, tmp_path, Means(jobs=2), lambda line: None) == []
 
 
 def test_stopping_ends_the_runs_too(tmp_path, trained, monkeypatch):
@@ -219,7 +219,7 @@ def test_stopping_ends_the_runs_too(tmp_path, trained, monkeypatch):
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with pytest.raises(KeyboardInterrupt):
-            running.reproduce([run], tmp_path, Means(jobs=1), lambda line: None)
+            running.dispatch([run], tmp_path, Means(jobs=1), lambda line: None)
     finally:
         signal.signal(signal.SIGINT, before)
     assert processes[0].poll() == -signal.SIGTERM

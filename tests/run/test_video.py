@@ -152,8 +152,8 @@ from metrpo.commands.main import main
 for command in (["tasks"], ["doctor"], ["render", sys.argv[1], "--out", "v.gif"]):
     print("exit code", main(command), flush=True)
 from pathlib import Path
-from metrpo.commands import main
-main._report(Path(sys.argv[1]), video=True)  # what a finished run says
+from metrpo.commands.train import say_outcome
+say_outcome(Path(sys.argv[1]), video=True)  # what a finished run says
 """
 
 

@@ -12,8 +12,7 @@ import pytest
 import probe
 from faults import Disk
 from metrpo import algorithm, external
-from metrpo.commands import main
-from metrpo.commands.options import parse
+from metrpo.commands.parse import parse
 from metrpo.errors import RunDirectoryError
 from metrpo.run import directory, lock, machine
 from metrpo.run.episodes import EpisodeLog
@@ -55,7 +54,7 @@ def command_line(run_dir, *more):
 
 
 with probe.registered():
-    CONFIG, _ = main._run(parse(command_line("anywhere")))
+    CONFIG = parse(command_line("anywhere")).config
 
 
 class Counted:

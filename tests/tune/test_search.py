@@ -17,8 +17,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from metrpo.commands import main, options
-from metrpo.commands.tune_typed import as_typed
+from metrpo.commands import main, parse
+from metrpo.commands.tune import Tune, search_of
 from metrpo.config import to_json
 from metrpo.console.interrupt import Stopped
 from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError, TaskError
@@ -200,7 +200,7 @@ def test_a_file_says_the_same_as_options(tmp_path):
     typed = ["tune", "--search", "trpo.max_kl=log 0.003..0.1", "--search", "ensemble.hidden=[8],[16,16]"]
     typed += ["--set", "imagine.steps=500", "--trials", "30", "--seeds", "0,2", "--real-steps", "6000"]
     found = from_file(file)
-    assert found == as_typed(options.parse([*typed, "--pruner", "halving"]))
+    assert found == search_of(parse.parse([*typed, "--pruner", "halving"]))
     assert found.steps == 2, "3,000 real steps in an iteration"
     (one, two) = found.runs(7, {"trpo.max_kl": 0.01, "ensemble.hidden": (16, 16)})
     assert (one.name, two.name) == ("Swimmer/trial-007/seed-0", "Swimmer/trial-007/seed-2")
@@ -224,7 +224,7 @@ def test_a_wrong_file_is_named(tmp_path, text, message):
     with pytest.raises(ConfigError, match=message):
         from_file(file)
     with pytest.raises(ConfigError, match=r"trials: expected it in search\.toml alone"):
-        options.Tune(spec=Path("search.toml"), trials=3)
+        Tune(spec=Path("search.toml"), trials=3)
 
 
 def test_the_objective_by_hand():
@@ -462,7 +462,7 @@ def test_tune_ends_with_a_table_a_picture_and_the_best_command(tmp_path, faked, 
     assert (record["best"]["command"], len(record["trials"]), faked.begun) == (best, 6, [])
     assert "6 of 6 trials are finished" in err
     monkeypatch.setattr("metrpo.run.machine.prepare", lambda *_, **__: None)
-    typed = options.parse(shlex.split(best)[1:])
+    typed = parse.parse(shlex.split(best)[1:])
     chosen = record["trials"][record["best"]["number"]]["settings"]
     assert (typed.trpo.max_kl, typed.ensemble.members) == (chosen["trpo.max_kl"], chosen["ensemble.members"])
 
@@ -605,7 +605,7 @@ def test_killed_with_its_run_tune_goes_on_from_the_checkpoint(tmp_path):
 def test_the_committed_search_is_what_its_page_says(tmp_path):
     page = (ROOT / "docs" / "tuning.md").read_text()
     line = next(part for part in page.split("```") if "--out results/tune" in part).replace("\\\n", " ")
-    asked = as_typed(options.parse(shlex.split(line)[1:]))
+    asked = search_of(parse.parse(shlex.split(line)[1:]))
     shutil.copy(ROOT / "results" / "tune" / FILE, tmp_path)
     found = tune(asked, tmp_path, 1, silent, Fake())
     assert (len(found.records), sum(r.state == "pruned" for r in found.records)) == (8, 2)

@@ -10,61 +10,13 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import arg
 
-GROUPS: dict[str, dict[str, str]] = {
-    "Learn": {
-        "train": "Learn a task, or go on with a run",
-        "tasks": "List the tasks that can be learnt",
-    },
-    "Look": {
-        "watch": "Show where many runs stand, live",
-        "report": "Write one HTML page: curves, warnings, videos",
-        "plot": "Draw learning curves",
-    },
-    "Use": {
-        "evaluate": "Play real episodes and say what they earn",
-        "render": "Record an episode as a video",
-        "export": "Write the policy as one file without metrpo",
-    },
-    "Many runs": {
-        "sweep": "Run a grid of tasks, seeds and settings",
-        "tune": "Search over settings",
-        "reproduce": "Run and draw a figure of the paper",
-    },
-    "Your robot": {
-        "init": "Start a run whose episodes another program plays",
-        "collect": "Add real episodes to a run",
-        "improve": "Learn from the episodes that wait, once",
-    },
-    "This machine": {
-        "doctor": "Check versions, devices, OpenGL, video encoder",
-        "bench": "Measure this machine and our work on it",
-    },
-}
-"""Purpose -> command -> what it does, in a few words."""
-
-FEW = frozenset(
-    {
-        "task",
-        "preset",
-        "seed",
-        "iterations",
-        "real_steps",
-        "system",
-        "data",
-        "learn_reward",
-        "evaluation_episodes",
-        "run_dir",
-        "device",
-        "video",
-    }
-)
-"""The options of a run that `--help` shows; `--help-all` shows all."""
+from metrpo.commands.table import COMMANDS
 
 
 def overview() -> str:
     """All commands, within 24 lines of 80 columns."""
     lines = ["usage: metrpo COMMAND [OPTIONS]     control learnt from few real steps (ME-TRPO)", ""]
-    for purpose, commands in GROUPS.items():
+    for purpose, commands in COMMANDS.items():
         for i, (name, text) in enumerate(commands.items()):
             lines.append(f"{purpose if i == 0 else '':<14}{name:<11}{text}")
     lines += ["", 'Start with: metrpo train Swimmer. "metrpo COMMAND --help" explains a command;']

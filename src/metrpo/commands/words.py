@@ -14,6 +14,7 @@ from typing import Annotated, TypeVar
 
 import tyro
 
+from metrpo.commands.options import RunOptions
 from metrpo.errors import ConfigError
 
 T = TypeVar("T")
@@ -98,7 +99,7 @@ def _needed(text: str, kind: type, arguments: Sequence[str]) -> str | None:
         if any(word.partition("=")[0] == f"--{name}" for word in arguments):
             return f"{command} takes {metavar} without --{name}: metrpo {command} {metavar}"
         if re.search(rf"^\W*Required .*\n(?:.*\n)*?\W*{re.escape(metavar)} ", text, re.MULTILINE):
-            what, more = _NEEDS[metavar]
+            what, more = _NEEDS.get(metavar, (metavar, ""))
             return f"{command} needs {what}: metrpo {command} {metavar}{more}"
     return None
 
@@ -115,7 +116,7 @@ def _complaint(text: str, kind: type, arguments: Sequence[str]) -> str:
     """The parser's own words, a title and paragraphs between rules, in short."""
     bare = (line.strip("│|╭╮╰╯─+- ") for line in text.splitlines())
     title, *lines = [line for line in bare if line] or ["Nothing"]
-    see = f"see metrpo {arguments[0]} {_help(arguments[0])}"
+    see = f"see metrpo {arguments[0]} {_help(kind)}"
     if title.startswith("Unrecognized"):
         return _unknown(kind, arguments)
     said = lines[0] if lines else title
@@ -172,13 +173,13 @@ def _unknown(kind: type, arguments: Sequence[str]) -> str:
             continue
         short = [o for o in options if o.rpartition(".")[2] == option.lstrip("-")]
         near = short[:1] or difflib.get_close_matches(option, options, 1)
-        return f"unknown option {word.partition('=')[0]}{_meant(near)} metrpo {command} {_help(command)} lists all"
+        return f"unknown option {word.partition('=')[0]}{_meant(near)} metrpo {command} {_help(kind)} lists all"
     return f"expected fewer words that belong to no option; see metrpo {command} --help"
 
 
-def _help(command: str) -> str:
+def _help(kind: type) -> str:
     """The option that lists all of a command's options."""
-    return "--help-all" if command in ("train", "init") else "--help"
+    return "--help-all" if issubclass(kind, RunOptions) else "--help"
 
 
 def _meant(near: Sequence[str]) -> str:

@@ -15,7 +15,7 @@ from typing import get_args
 
 import pytest
 
-from metrpo.commands import main, options
+from metrpo.commands import main, parse
 from metrpo.console.interrupt import Stopped
 from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError
 from metrpo.launch.backend import Backend, Means
@@ -43,8 +43,8 @@ def test_every_backend_in_the_table_has_the_same_signature():
 def test_options(command):
     typed = ["--backend", "ray", "--jobs", "2", "--cpus", "3", "--gpus", "0.5", "--address", "auto"]
     typed += ["--storage", "sent"]
-    assert options.parse([*command, *typed]).means == MEANS
-    assert options.parse(command).means == Means("local", None, None, 0.0, None, "shared")
+    assert parse.parse([*command, *typed]).means == MEANS
+    assert parse.parse(command).means == Means("local", None, None, 0.0, None, "shared")
 
 
 @pytest.mark.parametrize(

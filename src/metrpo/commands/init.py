@@ -1,0 +1,37 @@
+"""`metrpo init` starts a run whose episodes another program plays."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+
+from metrpo.commands.options import RunOptions
+
+
+@dataclass(frozen=True)
+class Init(RunOptions):
+    """Start a run whose episodes another program plays: a robot's own, say. Takes the same settings as train.
+
+    It writes the untrained policy. Then, again and again: play DIR's policy, add
+    the episodes (or call metrpo.append_episode in the program), improve. For example:
+        metrpo init path/to/arm.py:task --run-dir runs/arm
+        metrpo collect runs/arm --data today.npz
+        metrpo improve runs/arm
+
+    Every setting starts from the task's preset; metrpo init --help-all lists all.
+    """
+
+
+def run(command: Init) -> int:
+    """Returns the exit code."""
+    from metrpo.external import begin
+    from metrpo.run.policy_file import FILE
+    from metrpo.world.registry import get_task
+
+    config, run_dir = command.config, command.directory
+    begin(config, run_dir)
+    collect = f"metrpo collect {shlex.quote(str(run_dir))}"
+    how = collect if get_task(config.task).playable else f"metrpo.append_episode, or {collect} --data FILE"
+    print(f"{run_dir / FILE} is the untrained policy; add episodes ({how}), then")
+    print(f"metrpo improve {shlex.quote(str(run_dir))}")
+    return 0

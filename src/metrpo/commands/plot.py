@@ -1,0 +1,46 @@
+"""`metrpo plot` draws learning curves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from metrpo.commands.options import require_directories
+from metrpo.commands.output import warn_of_skipped
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Draw learning curves: a line with a band over the seeds for every group of runs that share their settings.
+
+    For example:
+        metrpo plot runs/sweep
+        metrpo plot runs/sweep --out sweep.pdf --x wall_seconds
+        metrpo plot runs --y gap --x iteration
+    """
+
+    dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
+    """Run directories, or folders with runs inside."""
+    out: Annotated[Path, arg(metavar="FILE")] = Path("curves.png")
+    """File to write, .png, .svg or .pdf; missing folders are made."""
+    x: Literal["real_steps", "wall_seconds", "iteration"] = "real_steps"
+    """What the curves are drawn against."""
+    y: Annotated[str, arg(metavar="COLUMN")] = "return_real"
+    """Column of metrics.csv or diagnostics.csv to draw, such as gap, outside, error_T, error_10_3 or improved_0."""
+
+    def __post_init__(self) -> None:
+        require_directories("plot", self.dirs)
+
+
+def run(command: Plot) -> int:
+    """Returns the exit code."""
+    from metrpo.plots.learning_curves import plot
+    from metrpo.run.find import find
+
+    found = find(command.dirs)
+    warn_of_skipped([{"path": path, "why": why} for path, why in found.skipped])
+    print(plot(found.runs, command.out, command.x, command.y))
+    return 0

@@ -1,0 +1,55 @@
+"""Every command: what it is for, its name and what it does. The file of that name holds the rest.
+
+`metrpo train` is `train.py`: the dataclass `Train`, of which tyro makes a parser, and `run(Train)`, which returns the
+exit code. To add a command, write its file and its row here.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+COMMANDS: dict[str, dict[str, str]] = {
+    "Learn": {
+        "train": "Learn a task, or go on with a run",
+        "tasks": "List the tasks that can be learnt",
+    },
+    "Look": {
+        "watch": "Show where many runs stand, live",
+        "report": "Write one HTML page: curves, warnings, videos",
+        "plot": "Draw learning curves",
+    },
+    "Use": {
+        "evaluate": "Play real episodes and say what they earn",
+        "render": "Record an episode as a video",
+        "export": "Write the policy as one file without metrpo",
+    },
+    "Many runs": {
+        "sweep": "Run a grid of tasks, seeds and settings",
+        "tune": "Search over settings",
+        "reproduce": "Run and draw a figure of the paper",
+    },
+    "Your robot": {
+        "init": "Start a run whose episodes another program plays",
+        "collect": "Add real episodes to a run",
+        "improve": "Learn from the episodes that wait, once",
+    },
+    "This machine": {
+        "doctor": "Check versions, devices, OpenGL, video encoder",
+        "bench": "Measure this machine and our work on it",
+    },
+}
+"""Purpose -> command -> what it does, in a few words."""
+
+NAMES = tuple(name for commands in COMMANDS.values() for name in commands)
+
+
+def options_class(name: str) -> type:
+    """The options of a command, as a dataclass."""
+    return getattr(importlib.import_module(f"metrpo.commands.{name}"), name.capitalize())
+
+
+def handler(name: str) -> Callable[[Any], int]:
+    """What runs a command with its options and returns the exit code."""
+    return importlib.import_module(f"metrpo.commands.{name}").run

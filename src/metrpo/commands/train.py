@@ -1,0 +1,97 @@
+"""`metrpo train` learns a task, or goes on with a run."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import arg
+
+from metrpo.commands.options import RunOptions, Switch
+from metrpo.commands.stopping import attended_run
+from metrpo.config import Config
+from metrpo.console.interrupt import Interruptible
+from metrpo.errors import MetrpoError
+
+_log = logging.getLogger("metrpo")
+_AGAIN = "The same command would only make what is missing of its record, such as the video."
+
+
+@dataclass(frozen=True)
+class Train(RunOptions):
+    """Learn a task, or go on with a run: the same command again resumes it.
+
+    For example:
+        metrpo train Swimmer
+        metrpo train HalfCheetah --seed 1 --real-steps 60000 --run-dir runs/cheetah
+        metrpo train Pendulum-v1 --ensemble.members 10 --trpo.max-kl 0.02
+
+    Every setting starts from the task's preset; metrpo train --help-all lists all.
+    """
+
+    video: Annotated[Switch, arg(help="Do not record the final policy as a video.")] = True
+
+
+def run(command: Train) -> int:
+    """Returns the exit code."""
+    from metrpo.console.progress import default_progress
+    from metrpo.training import train
+
+    config, run_dir = command.config, command.directory
+
+    def complete(progress: Interruptible) -> str | None:
+        return f"{run_dir} is complete: nothing is lost. {_AGAIN}" if _is_complete(run_dir, config) else None
+
+    by_episode = config.method == "model-based"
+    with attended_run(run_dir, default_progress(), keeps_episodes=by_episode, complete=complete) as progress:
+        train(config, run_dir, progress)
+        progress.close()
+        try:
+            say_outcome(run_dir, command.video)
+        except OSError as error:  # nobody reads on; the run is complete
+            _log.warning("cannot say more (%s: %s); %s is complete", type(error).__name__, error, run_dir)
+    return 0
+
+
+def _is_complete(run_dir: Path, config: Config) -> bool:
+    """Whether all iterations that were asked for are on disk."""
+    from metrpo.run.find import is_finished, read
+
+    with suppress(MetrpoError):
+        return is_finished(dataclasses.replace(read(run_dir), config=config))
+    return False
+
+
+def say_outcome(run_dir: Path, video: bool) -> None:
+    """Says what the run has earned and where its files lie; a machine that cannot make a video costs the video only."""
+    from metrpo.console.progress import outcome
+    from metrpo.evaluation import render
+    from metrpo.run.metrics import read_metrics
+    from metrpo.run.video import VideoError
+
+    last = read_metrics(run_dir / "metrics.csv")[-1]
+    print(outcome(last, run_dir))
+    files = {"curve": "curve.png", "metrics": "metrics.csv", "policy": "policy.npz"}
+    for what, name in files.items():
+        print(f"  {what:<8} {run_dir / name}", flush=True)
+    if not video:
+        return
+    print(f"  {'video':<8} ", end="", flush=True)  # it takes a while
+    try:
+        print(_video_of(run_dir) or render(run_dir))
+    except Exception as error:  # the run is complete without it
+        print(f"none: {error}" if isinstance(error, VideoError) else f"none ({type(error).__name__}: {error})")
+
+
+def _video_of(run_dir: Path) -> Path | None:
+    """The run's video, if there is one of its policy as it is now."""
+    from metrpo.run.policy_file import FILE
+
+    video = run_dir / "video.mp4"
+    with suppress(OSError):
+        return video if video.stat().st_mtime_ns >= (run_dir / FILE).stat().st_mtime_ns else None
+    return None
