@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+import math
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,10 +89,9 @@ def say_outcome(run_dir: Path, video: bool) -> None:
 
 
 def _video_of(run_dir: Path) -> Path | None:
-    """The run's video, if there is one of its policy as it is now."""
-    from metrpo.run.policy_file import FILE
-
+    """The run's video, if there is one of its policy as it is now: the policy's file is written anew at every start."""
     video = run_dir / "video.mp4"
     with suppress(OSError):
-        return video if video.stat().st_mtime_ns >= (run_dir / FILE).stat().st_mtime_ns else None
+        learned = max((path.stat().st_mtime_ns for path in (run_dir / "checkpoints").iterdir()), default=math.inf)
+        return video if video.stat().st_mtime_ns >= learned else None
     return None
