@@ -17,7 +17,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from metrpo import algorithm, config, get_task
+from metrpo import config, get_task, init
 from metrpo.model import ensemble as ensembles
 from metrpo.model.fit import fit
 from metrpo.presets import override
@@ -37,7 +37,7 @@ def main() -> None:
     settings = config.from_json((arguments.run_dir / "config.json").read_text())
     task = get_task(settings.task)
     with RunDirectory(arguments.run_dir, settings) as run:
-        state = run.load(algorithm.init(settings))
+        state = run.load(init(settings))
     if state is None or state.iteration < ITERATIONS:
         parser.error(f"{arguments.run_dir}: expected a run of at least {ITERATIONS} iterations with its checkpoint")
 

@@ -49,7 +49,7 @@ Save = Callable[[dict[str, Any]], None]
 
 def stages(task: str, name: str, tiny: bool, seconds: float, save: Save) -> None:
     """Whole outer iterations of a preset, each with its seconds per stage, as many as there is time for."""
-    from metrpo import algorithm
+    from metrpo import training
     from metrpo.console.progress import PlainProgress
     from metrpo.presets import override, preset
     from metrpo.speed.measure import compilations
@@ -57,12 +57,12 @@ def stages(task: str, name: str, tiny: bool, seconds: float, save: Save) -> None
     end, rows = time.monotonic() + seconds, []
     cuts = TINY_CUTS if tiny else CUTS[name]
     config = override(preset(task, name), cuts)
-    state, last, progress = algorithm.init(config), 0.0, PlainProgress()
+    state, last, progress = training.init(config), 0.0, PlainProgress()
     while state.iteration < config.iterations and time.monotonic() + last < end:
         progress.begin(state.iteration + 1, config.iterations)
         start = time.monotonic()
         with compilations() as seen:
-            state, row = algorithm.step(config, state, progress)
+            state, row = training.step(config, state, progress)
         last = time.monotonic() - start
         progress.end(row)
         kept = ("real_steps", "return_real", "return_imagined", "updates", "accepted_updates", "fit_passes")

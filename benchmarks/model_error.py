@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from metrpo import algorithm, config, get_task
+from metrpo import config, get_task, init
 from metrpo.model import ensemble as ensembles
 from metrpo.policy import gaussian
 from metrpo.run.checkpoint import load_state
@@ -50,7 +50,7 @@ def main() -> None:
     settings = config.from_json((arguments.run_dir / "config.json").read_text())
     task = get_task(settings.task)
     newest = sorted((arguments.run_dir / "checkpoints").glob("*.npz"))[-1]
-    state, _ = load_state(newest, algorithm.init(settings))
+    state, _ = load_state(newest, init(settings))
     e = settings.ensemble
     normaliser = ensembles.normaliser_of(state.dataset.train, e.std_floor, e.delta_std_floor, task.unseen)
     ensemble = ensembles.Ensemble(state.networks, normaliser)

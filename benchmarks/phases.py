@@ -17,7 +17,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from metrpo import algorithm, config, policy_phase
+from metrpo import algorithm, config, init, policy_phase
 from metrpo.config import Config
 from metrpo.console.progress import SILENT
 from metrpo.model import ensemble as ensembles
@@ -28,6 +28,7 @@ from metrpo.presets import override
 from metrpo.run.clock import Clock
 from metrpo.run.directory import RunDirectory
 from metrpo.seeds import Stage, key_of
+from metrpo.world.registry import task_for
 
 
 def main() -> None:
@@ -41,7 +42,7 @@ def main() -> None:
     arguments = parser.parse_args()
     settings = config.from_json((arguments.run_dir / "config.json").read_text())
     with RunDirectory(arguments.run_dir, settings) as run:
-        state = run.load(algorithm.init(settings))
+        state = run.load(init(settings))
     if state is None:
         parser.error(f"{arguments.run_dir}: expected a run with a checkpoint, got none")
     for variant in arguments.variants:
@@ -55,10 +56,10 @@ def main() -> None:
 def phases(config: Config, state: algorithm.State, count: int, fresh: bool, variant: str, seed: int) -> float:
     """Plays `count` phases and returns what the last policy earns."""
     config = override(config, {"seed": seed})
-    task, e, data = algorithm.task_for(config), config.ensemble, state.dataset
+    task, e, data = task_for(config), config.ensemble, state.dataset
     normaliser = ensembles.normaliser_of(data.train, e.std_floor, e.delta_std_floor, task.unseen)
     ensemble = Ensemble(state.networks, normaliser)
-    first = algorithm.init(config).policy if fresh else state.policy
+    first = init(config).policy if fresh else state.policy
     baseline = init_baseline(config, task.state_size, key_of(seed, 0, Stage.IMPROVE))
     state = state._replace(policy=first, baseline=baseline)
     earned = np.nan

@@ -27,6 +27,7 @@ from metrpo.policy.value import linear
 from metrpo.presets import override, preset
 from metrpo.run import clock as clock_module
 from metrpo.speed.measure import compilations
+from metrpo.world import registry
 
 TINY = override(
     Config(task="Probe", iterations=4, evaluation_episodes=2),
@@ -56,10 +57,10 @@ def _probe_is_a_task():
 
 def run(config, iterations=4):
     """States (the first included), rows and the number of compilations of each iteration."""
-    states, rows, counts = [algorithm.init(config)], [], []
+    states, rows, counts = [training.init(config)], [], []
     for _ in range(iterations):
         with compilations() as seen:
-            state, row = algorithm.step(config, states[-1])
+            state, row = training.step(config, states[-1])
         states.append(state)
         rows.append(row)
         counts.append(len(seen))
@@ -111,7 +112,7 @@ def test_a_step_leaves_its_state_as_it_was_and_can_be_repeated(tiny):
     for at in (0, 2):
         state = tiny.states[at]
         before = jax.tree.map(np.array, state)
-        again, row = algorithm.step(TINY, state)
+        again, row = training.step(TINY, state)
         assert not any(x.is_deleted() for x in jax.tree.leaves(state) if isinstance(x, jax.Array))
         assert equal(before, state)
         assert without_clock(row) == without_clock(tiny.rows[at])
@@ -141,15 +142,15 @@ def test_a_budget_of_real_steps_is_spent_and_no_more():
 @pytest.mark.parametrize("ends", ["Probe", "EndingProbe"])
 def test_collection_stops_at_a_budget_below_one_iterations(tiny, ends):
     config = override(TINY, {"task": ends, "real_steps": 33, "collect.steps": 500})
-    episodes = algorithm.collect(config, tiny.states[0])
+    episodes = algorithm.collect(config, probe.PROBE, tiny.states[0])
     assert sum(len(e.rewards) for e in episodes) == 33
-    whole = algorithm.collect(override(config, {"real_steps": None}), tiny.states[0])
+    whole = algorithm.collect(override(config, {"real_steps": None}), probe.PROBE, tiny.states[0])
     for cut, e in zip(episodes, whole, strict=False):
         np.testing.assert_array_equal(cut.states, e.states[: len(cut.states)])
     assert not episodes[-1].terminated, "the budget is no end of the task"
     first = whole[:1]
     log = types.SimpleNamespace(pending=lambda: list(first), append=lambda e: None, failures=dict)
-    resumed = algorithm.collect(config, tiny.states[0], log=log)
+    resumed = algorithm.collect(config, probe.PROBE, tiny.states[0], log=log)
     assert sum(len(e.rewards) for e in resumed) == 33, "steps that wait count"
 
 
@@ -160,7 +161,7 @@ def test_episodes_of_the_record_have_a_bound(tiny, monkeypatch):
     returns = algorithm.evaluate(TINY, probe.LONG_PROBE, tiny.states[0].policy, 1)
     assert len(returns) == 2
     assert len(asked) == 2 * 7
-    _, row = algorithm.step(TINY, tiny.states[0])
+    _, row = training.step(TINY, tiny.states[0])
     assert np.isnan(row["gap"]), "imagined episodes are longer than evaluated ones"
 
 
@@ -223,6 +224,18 @@ def test_rows_say_what_happened(tiny):
     assert len({tuple(r) for r in tiny.rows}) == 1, "the same columns in every row"
 
 
+def test_a_run_looks_its_task_up_once(monkeypatch):
+    """What is passed on from there cannot become another task under way."""
+
+    class Forgetful(Progress):
+        def begin(self, iteration: int, of: int | None) -> None:
+            registry._TASKS.pop("Once", None)
+
+    monkeypatch.setitem(registry._TASKS, "Once", probe.PROBE)
+    config = override(Config("Once"), probe.BRIEF | {"iterations": 2})
+    assert training.train(config, None, Forgetful()).iteration == 2
+
+
 def test_the_return_is_the_accepted_policys_without_noise(tiny, monkeypatch):
     seen = {}
 
@@ -231,7 +244,7 @@ def test_the_return_is_the_accepted_policys_without_noise(tiny, monkeypatch):
         return np.array([1.0, 4.0])
 
     monkeypatch.setattr(algorithm.real, "evaluate", evaluate)
-    state, row = algorithm.step(TINY, tiny.states[1])
+    state, row = training.step(TINY, tiny.states[1])
     assert (row["return_real"], row["return_real_std"]) == (2.5, 1.5)
     assert seen["episodes"] == 2
     s = np.array([0.3, -0.4])
@@ -256,7 +269,7 @@ def test_the_previous_policy_precedes_the_last_changing_phase(tiny, monkeypatch,
 
     monkeypatch.setattr(algorithm, "_improve", phase)
     old = tiny.states[2]._replace(previous_policy=random_policy(8, 2, 2, hidden=(4,)))
-    new, _ = algorithm.step(TINY, old)
+    new, _ = training.step(TINY, old)
     assert equal(new.policy, policy)
     assert equal(new.previous_policy, old.policy if accepted else old.previous_policy)
 
@@ -499,7 +512,7 @@ def test_the_oracle_plays_other_starts_than_the_record(tiny, monkeypatch):
         return np.arange(episodes, dtype=float)
 
     monkeypatch.setattr(algorithm.real, "evaluate", evaluate)
-    algorithm.step(override(TINY, {"validate.rule": "real"}), tiny.states[1])
+    training.step(override(TINY, {"validate.rule": "real"}), tiny.states[1])
     *oracle, record = seeds
     assert len(oracle) >= 2
     assert len(set(oracle)) == 1, "policies are compared on the same starts"
@@ -636,7 +649,7 @@ def test_the_whole_loop_finds_the_optimum_of_the_probe():
     optimum = probe.optimum()
     for seed in (0, 1):
         config = override(LEARN, {"seed": seed})
-        before = probe.real_return(algorithm.init(config).policy)
+        before = probe.real_return(training.init(config).policy)
         state = training.train(config)
         after = probe.real_return(state.policy)
         assert state.real_steps == 600

@@ -262,7 +262,7 @@ def test_a_run_with_an_offset_resumes_byte_for_byte(tmp_path, known, monkeypatch
     assert said == [task.name]
     stored = load_policy(tmp_path / "whole")
     assert stored.origin == pytest.approx([1e8, 1e8])
-    state = load_state(parts / newest, algorithm.init(config))[0]
+    state = load_state(parts / newest, training.init(config))[0]
     # The record was earned by the policy in the file, counted from its origin.
     earned = algorithm.evaluate(config, task, state.policy, 2, origin=state.origin).mean()
     assert earned == pytest.approx(stored.info.return_real, rel=1e-6)
@@ -284,9 +284,9 @@ LEARN = {
 def test_the_probe_is_learned_whatever_its_scale_and_offset(known, scale, offset):
     task = known(seen(scale, offset))
     config = override(preset(task.name), probe.LEARN | LEARN)
-    state = algorithm.init(config)
+    state = training.init(config)
     for _ in range(config.iterations):
-        state, row = algorithm.step(config, state)
+        state, row = training.step(config, state)
     assert row["return_real"] > 1.1 * probe.optimum()
 
 

@@ -49,7 +49,6 @@ from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
 from metrpo.world.dataset import Dataset
 from metrpo.world.origin import relative, shifted
-from metrpo.world.registry import get_task, without_formulas
 from metrpo.world.size_limits import RECORDED
 from metrpo.world.task import Task
 
@@ -82,12 +81,11 @@ class State(NamedTuple):
         return self.dataset.origin
 
 
-def init(config: Config) -> State:
+def init(config: Config, task: Task) -> State:
     """The state before the first iteration.
 
-    Raises `TaskError` for an unknown task, `ConfigError` for settings that contradict each other.
+    Raises `ConfigError` for settings that contradict each other, `TaskError` for offline data that do not fit.
     """
-    task = task_for(config)
     if config.imagine.horizon is not None and config.advantage.discount == 1:
         # Undiscounted, a value that leans on itself grows without bound.
         raise ConfigError("advantage.discount: expected less than 1 with imagine.horizon (0.99, say), got 1.0")
@@ -148,12 +146,14 @@ class Unkept:
         self._failures = dict(failures)
 
 
-def step(config: Config, state: State, progress: Progress = SILENT, log: Log | None = None) -> tuple[State, Row]:
+def step(
+    config: Config, task: Task, state: State, progress: Progress = SILENT, log: Log | None = None
+) -> tuple[State, Row]:
     """One outer iteration: collect, fit, improve until the ensemble disagrees; and evaluate, for the record only."""
     clock, log = Clock(), log or Unkept()
     with clock("collect"):
-        episodes = collect(config, state, progress, log)
-    return learn(config, state, episodes, progress, clock, left_out(log))
+        episodes = collect(config, task, state, progress, log)
+    return learn(config, task, state, episodes, progress, clock, left_out(log))
 
 
 def left_out(log: Log) -> int:
@@ -162,7 +162,12 @@ def left_out(log: Log) -> int:
 
 
 def collect(
-    config: Config, state: State, progress: Progress = SILENT, log: Log | None = None, at_least: int | None = None
+    config: Config,
+    task: Task,
+    state: State,
+    progress: Progress = SILENT,
+    log: Log | None = None,
+    at_least: int | None = None,
 ) -> list[Episode]:
     """The real episodes of the next iteration: those that wait in `log`, and more until they have enough steps.
 
@@ -183,7 +188,7 @@ def collect(
         number = len(episodes) + left_out(log)
         try:
             with naming("collect", state.iteration + 1):
-                _play(config, state, number, episodes, (enough, at_most), log, progress)
+                _play(config, task, state, number, episodes, (enough, at_most), log, progress)
         except EpisodeError as error:
             _note_failure(log, len(episodes) + left_out(log), error)
     return episodes
@@ -191,6 +196,7 @@ def collect(
 
 def _play(
     config: Config,
+    task: Task,
     state: State,
     first: int,
     episodes: list[Episode],
@@ -200,7 +206,7 @@ def _play(
 ) -> None:
     """Adds episodes from number `first` on to `episodes` until their steps are within `bounds`, least and most."""
     enough, at_most = bounds
-    inputs = _inputs(config, task_for(config), state.dataset)
+    inputs = _inputs(config, task, state.dataset)
     mean = partial(
         _perturbed, _host(state.policy), _host(state.previous_policy), config.collect.parameter_noise, inputs=inputs
     )
@@ -208,7 +214,7 @@ def _play(
     # Each episode has randomness of its own, so that it is the same one after any interruption.
     rngs = (rng_of(config.seed, state.iteration + 1, Stage.COLLECT, number) for number in itertools.count(first))
     steps, longest = sum(len(e.rewards) for e in episodes), config.collect.steps
-    with closing(real.play(task_for(config), explorer, rngs, longest, progress.played, at_most - steps)) as played:
+    with closing(real.play(task, explorer, rngs, longest, progress.played, at_most - steps)) as played:
         while steps < enough:
             episodes.append(next(played))
             log.append(episodes[-1])
@@ -229,6 +235,7 @@ def _note_failure(log: Log, number: int, error: EpisodeError) -> None:
 
 def learn(
     config: Config,
+    task: Task,
     state: State,
     episodes: list[Episode],
     progress: Progress = SILENT,
@@ -241,7 +248,6 @@ def learn(
 
     Raises `DivergedError` where what is learned is not finite and cannot be recovered.
     """
-    task = task_for(config)
     iteration = state.iteration + 1
     clock = clock or Clock()
     rng = rng_of(config.seed, iteration, Stage.SPLIT)
@@ -441,12 +447,6 @@ def _logged(config: Config, task: Task) -> Dataset:
         return nothing
     rng = rng_of(config.seed, 0, Stage.SPLIT)
     return datasets.add(nothing, offline_data.load(config.data, task), config.collect, rng, task.learned)
-
-
-def task_for(config: Config) -> Task:
-    """The config's task, its formulas left out where they are to be learned."""
-    task = get_task(config.task)
-    return without_formulas(task) if config.learn_reward else task
 
 
 def evaluate(

@@ -27,7 +27,8 @@ from metrpo.run.metrics import Row
 from metrpo.training import check
 from metrpo.types import Episode
 from metrpo.world import offline_data
-from metrpo.world.registry import get_task
+from metrpo.world.registry import task_for
+from metrpo.world.task import Task
 
 
 def begin(config: Config, run_dir: str | Path) -> None:
@@ -35,11 +36,12 @@ def begin(config: Config, run_dir: str | Path) -> None:
 
     Raises `RunDirectoryError` when `run_dir` cannot be used or holds a run, `TaskError` and `ConfigError` as `train`.
     """
-    state = _ours(config)
-    with RunDirectory(run_dir, config) as run:
+    known = task_for(config)
+    state = _ours(config, known)
+    with RunDirectory(run_dir, config, known.interface) as run:
         if run.load(state) is not None:
             raise RunDirectoryError(f"{run_dir} holds a run already: go on with metrpo improve, or choose another")
-        check(config)
+        check(config, known)
         task_file.remember(run_dir, config.task)
         run.begin(state)
 
@@ -61,18 +63,18 @@ def collect(
     `ConfigError` when the budget is spent and `at_least` does not ask for more.
     """
     config = stored_config(run_dir)
-    _settle(run_dir, config.task, task)
-    with RunDirectory(run_dir, config) as run:
-        state = _state(run, config)
+    known = _settled(run_dir, config, task)
+    with RunDirectory(run_dir, config, known.interface) as run:
+        state = _state(run, config, known)
         if data is not None:
             waiting = Counter(map(_content, run.episodes.pending()))
-            for episode in offline_data.load(data, algorithm.task_for(config)):
+            for episode in offline_data.load(data, known):
                 if waiting[_content(episode)]:  # added already, when this was stopped half-way
                     waiting[_content(episode)] -= 1
                 else:
                     run.episodes.append(episode)
             return run.episodes.pending()
-        algorithm.task_for(config).require_playable()
+        known.require_playable()
         if at_least is None and budget.steps_left(config, state.real_steps) == 0:
             raise ConfigError(
                 f"real_steps: the budget of {run_dir}, {config.real_steps:,}, is spent; to play more all the same: "
@@ -80,7 +82,7 @@ def collect(
             )
         progress.begin(state.iteration + 1, None)
         try:
-            return algorithm.collect(config, state, progress, run.episodes, at_least)
+            return algorithm.collect(config, known, state, progress, run.episodes, at_least)
         finally:
             progress.close()
 
@@ -92,9 +94,9 @@ def improve(run_dir: str | Path, progress: Progress = SILENT, task: str | None =
     or no episodes wait.
     """
     config = stored_config(run_dir)
-    _settle(run_dir, config.task, task)
-    with RunDirectory(run_dir, config) as run:
-        state = _state(run, config)
+    known = _settled(run_dir, config, task)
+    with RunDirectory(run_dir, config, known.interface) as run:
+        state = _state(run, config, known)
         episodes = run.episodes.pending()
         if not episodes:
             raise RunDirectoryError(
@@ -104,19 +106,20 @@ def improve(run_dir: str | Path, progress: Progress = SILENT, task: str | None =
         progress.begin(state.iteration + 1, None)
         try:
             failed = algorithm.left_out(run.episodes)
-            written = run.save(*algorithm.learn(config, state, episodes, progress, None, failed))
+            written = run.save(*algorithm.learn(config, known, state, episodes, progress, None, failed))
             progress.end(written, None)
         finally:
             progress.close()
     return written
 
 
-def _settle(run_dir: str | Path, name: str, where: str | None) -> None:
-    """Makes the run's task known under its name, from its file's old place or the new one."""
+def _settled(run_dir: str | Path, config: Config, where: str | None) -> Task:
+    """The run's task, known under its name from now on: from its file's old place or the new one."""
     if where is None:
-        task_file.task_of_run(run_dir, name)
+        task_file.task_of_run(run_dir, config.task)
     else:
-        task_file.moved(name, where)
+        task_file.moved(config.task, where)
+    return task_for(config)
 
 
 def _content(episode: Episode) -> tuple[bytes | bool, ...]:
@@ -129,13 +132,13 @@ def _content(episode: Episode) -> tuple[bytes | bool, ...]:
     )
 
 
-def _ours(config: Config) -> State:
+def _ours(config: Config, task: Task) -> State:
     if config.method != "model-based":
         raise ConfigError(f"system: expected one that learns models, got {config.system}; it runs by metrpo train only")
-    require_memory(config, get_task(config.task))
-    return algorithm.init(config)
+    require_memory(config, task)
+    return algorithm.init(config, task)
 
 
-def _state(run: RunDirectory, config: Config) -> State:
-    state = _ours(config)
+def _state(run: RunDirectory, config: Config, task: Task) -> State:
+    state = _ours(config, task)
     return run.load(state) or state

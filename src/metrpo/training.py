@@ -1,7 +1,8 @@
 """Training by any method: one outer iteration after the other until the budget is spent, saved and resumed.
 
 `algorithm` is the method that this project is for; `baselines` are what it is compared with. A method is a pair of
-functions, init(config) -> state and step(config, state, progress) -> (state, row of metrics).
+functions, init(config, task) -> state and step(config, task, state, progress) -> (state, row of metrics). The task is
+looked up here, once, and passed on.
 """
 
 from __future__ import annotations
@@ -28,8 +29,9 @@ from metrpo.run.yardstick_record import are_kept, keep
 from metrpo.seeds import Stage, rng_of
 from metrpo.world.env_returns import warning_once
 from metrpo.world.formula_check import check_formulas
-from metrpo.world.registry import get_task
+from metrpo.world.registry import task_for
 from metrpo.world.size_limits import RECORDED
+from metrpo.world.task import Task
 from metrpo.world.tasks.gymnasium_formulas import KNOWN
 from metrpo.world.yardsticks import measure
 
@@ -51,10 +53,14 @@ def init(config: Config) -> Saved:
     Raises `TaskError` for an unknown task or unfitting data, `ConfigError` for settings that contradict each other or
     ask for more memory than there is.
     """
+    return _init(config, task_for(config))
+
+
+def _init(config: Config, task: Task) -> Saved:
     if config.method != "model-based" and (config.data is not None or config.real_steps == 0):
         raise ConfigError(f"data: only the method model-based learns from logged transitions, got {config.method}")
-    require_memory(config, get_task(config.task))
-    state: Saved = import_module(METHODS[config.method]).init(config)
+    require_memory(config, task)
+    state: Saved = import_module(METHODS[config.method]).init(config, task)
     return state
 
 
@@ -63,8 +69,12 @@ def step(config: Config, state: Saved, progress: Progress = SILENT, log: Log | N
 
     Real episodes go to `log` as they end, where the method is ours: the baselines learn where steps cost nothing.
     """
+    return _step(config, task_for(config), state, progress, log)
+
+
+def _step(config: Config, task: Task, state: Saved, progress: Progress, log: Log | None) -> tuple[Saved, Row]:
     logged = (log,) if config.method == "model-based" else ()
-    following: tuple[Saved, Row] = import_module(METHODS[config.method]).step(config, state, progress, *logged)
+    following: tuple[Saved, Row] = import_module(METHODS[config.method]).step(config, task, state, progress, *logged)
     if not logged:  # ours looks at every stage by itself
         require_finite("learn", following[0].iteration, "lower its learning rates", state=following[0])
     return following
@@ -84,19 +94,20 @@ def train(config: Config, run_dir: str | Path | None = None, progress: Progress 
 
 
 def _train(config: Config, run_dir: str | Path | None, progress: Progress) -> Saved:
-    template = init(config)
+    task = task_for(config)
+    template = _init(config, task)
     if run_dir is None:
-        check(config)
-        return _loop(config, template, progress, lambda state, row: row)
-    with RunDirectory(run_dir, config) as run:
+        check(config, task)
+        return _loop(config, task, template, progress, lambda state, row: row)
+    with RunDirectory(run_dir, config, task.interface) as run:
         task_file.remember(run_dir, config.task)
         state, measured = run.load(template), are_kept(run.path, config.task)
         _say_where(config, run, state or template, measured, progress)
         if state is None:
-            check(config)
+            check(config, task)
             if not measured:
-                _measure_yardsticks(config, run, progress)
-        return _loop(config, state or template, progress, run.save, run.episodes)
+                _measure_yardsticks(config, task, run, progress)
+        return _loop(config, task, state or template, progress, run.save, run.episodes)
 
 
 def _say_where(config: Config, run: RunDirectory, state: Saved, measured: bool, progress: Progress) -> None:
@@ -108,12 +119,11 @@ def _say_where(config: Config, run: RunDirectory, state: Saved, measured: bool, 
         progress.resume(str(run.path), state.iteration + 1, of, state.real_steps, waiting)
 
 
-def check(config: Config) -> None:
+def check(config: Config, task: Task) -> None:
     """Holds the formulas of a task that is not ours against its environment (`metrpo.world.formula_check`).
 
     Says what evaluation will cut. Raises `TaskError` where they differ.
     """
-    task = get_task(config.task)
     if task.playable and task.horizon > RECORDED:
         _log.warning(
             "%s: episodes of up to %s steps: evaluation cuts them after %s, and there is no gap between imagined and "
@@ -125,9 +135,8 @@ def check(config: Config) -> None:
         check_formulas(task, rng_of(config.seed, 0, Stage.COLLECT))
 
 
-def _measure_yardsticks(config: Config, run: RunDirectory, progress: Progress) -> None:
+def _measure_yardsticks(config: Config, task: Task, run: RunDirectory, progress: Progress) -> None:
     """Keeps in run.json, and says, what no skill earns: real steps that nobody counts and nothing is learned from."""
-    task = get_task(config.task)
     if not task.playable or config.real_steps == 0:
         return
     try:
@@ -141,6 +150,7 @@ def _measure_yardsticks(config: Config, run: RunDirectory, progress: Progress) -
 
 def _loop(
     config: Config,
+    task: Task,
     state: Saved,
     progress: Progress,
     save: Callable[[Saved, Row], Mapping[str, Any]],
@@ -152,7 +162,7 @@ def _loop(
             started = time.monotonic()
             left = _iterations_left(config, state)
             progress.begin(state.iteration + 1, None if left is None else state.iteration + left)
-            state, row = step(config, state, progress, log)
+            state, row = _step(config, task, state, progress, log)
             written = save(state, row)
             seconds.append(time.monotonic() - started)
             progress.end(written, _seconds_left(seconds, _iterations_left(config, state)))

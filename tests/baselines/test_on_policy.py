@@ -275,7 +275,7 @@ def test_the_value_network_learns_the_returns_to_go():
     rng = np.random.default_rng(6)
     path, _ = path_of(rng, WEIGHTS, BIAS, STD, 12, np.array([0.3, 0.3]))
     config = override(SVG, {"svg.value_steps": 4000, "svg.horizon": "1"})
-    state = value_gradients.init(config)
+    state = value_gradients.init(config, probe.PROBE)
     normaliser = random_ensemble(0, members=1, state_size=2, action_size=2).normaliser
     value, _ = jax.jit(value_gradients._train_value, static_argnums=0)(
         config, normaliser, state.value, state.value_moments, path

@@ -49,9 +49,9 @@ def runs():
 
 
 def run(config, iterations):
-    states, rows = [stable_baselines.init(config)], []
+    states, rows = [stable_baselines.init(config, probe.PROBE)], []
     for _ in range(iterations):
-        state, row = stable_baselines.step(config, states[-1])
+        state, row = stable_baselines.step(config, probe.PROBE, states[-1])
         states.append(state)
         rows.append(row)
     return states, rows
@@ -96,7 +96,7 @@ def test_the_networks_and_adam_change_and_are_kept(runs, method):
 @METHODS
 def test_the_state_goes_into_the_library_and_comes_out_again(runs, method):
     config, state = override(TINY, {"method": method}), runs[method][0][3]
-    env = stable_baselines._environment(config)
+    env = stable_baselines._environment(probe.PROBE)
     assert equal(stable_baselines._state(config, stable_baselines._model(config, env, 0, state), 3), state)
     env.close()
 
@@ -105,7 +105,7 @@ def test_the_state_goes_into_the_library_and_comes_out_again(runs, method):
 def test_a_step_leaves_its_state_as_it_was_and_can_be_repeated(runs, method):
     config, (states, rows) = override(TINY, {"method": method}), runs[method]
     before = jax.tree.map(np.array, states[1])
-    again, row = stable_baselines.step(config, states[1])
+    again, row = stable_baselines.step(config, probe.PROBE, states[1])
     assert equal(states[1], before)
     assert equal(again, states[2])
     assert {n: x for n, x in row.items() if "seconds" not in n} == {
@@ -120,10 +120,10 @@ def test_a_resumed_run_equals_an_uninterrupted_one(runs, method, tmp_path):
     # Nothing may hang on what this process has drawn before.
     torch.manual_seed(99)
     np.random.seed(99)
-    state, _ = load_state(tmp_path / "state.npz", stable_baselines.init(config))
+    state, _ = load_state(tmp_path / "state.npz", stable_baselines.init(config, probe.PROBE))
     assert equal(state, states[2])
     assert all(isinstance(x, int | np.ndarray) for x in jax.tree.leaves(state))
-    resumed, _ = stable_baselines.step(config, state)
+    resumed, _ = stable_baselines.step(config, probe.PROBE, state)
     assert equal(resumed, states[3])
 
 
@@ -155,7 +155,7 @@ def test_the_seed_decides_the_whole_run(runs, method):
 def test_the_exported_policy_acts_as_stable_baselines3_predicts(runs, method, tmp_path):
     config, state = override(TINY, {"method": method}), runs[method][0][3]
     states = np.random.default_rng(0).normal(scale=3.0, size=(1000, 2)).astype(np.float32)
-    env = stable_baselines._environment(config)
+    env = stable_baselines._environment(probe.PROBE)
     expected, _ = stable_baselines._model(config, env, 0, state).predict(states, deterministic=True)
     env.close()
     np.testing.assert_allclose(np.clip(gaussian.mean(state.policy, states), -1, 1), expected, atol=1e-5)
@@ -209,7 +209,7 @@ def test_real_steps_are_counted_one_by_one(monkeypatch, method, steps, taken):
     counted = Counted(monkeypatch)
     monkeypatch.setattr(defaults, "PPO_STEPS", 256)
     config = override(TINY, {"method": method, "collect.steps": steps})
-    state, row = stable_baselines.step(config, stable_baselines.init(config))
+    state, row = stable_baselines.step(config, probe.PROBE, stable_baselines.init(config, probe.PROBE))
     evaluated = config.evaluation_episodes * probe.HORIZON
     assert state.real_steps == row["real_steps"] == counted.steps - evaluated == taken
     assert len(state.replay.get("rewards", [])) == (taken if method == "ddpg" else 0)
@@ -250,7 +250,7 @@ def test_ppo_values_nothing_after_the_end_of_the_clock(monkeypatch, discount):
 
     monkeypatch.setattr(defaults.PPO, "train", train)
     config = override(TINY, {"method": "ppo", "advantage.discount": discount})
-    stable_baselines.step(config, stable_baselines.init(config))
+    stable_baselines.step(config, probe.PROBE, stable_baselines.init(config, probe.PROBE))
     (last, *_) = np.flatnonzero(seen["first"][1:])
     action = np.clip(seen["actions"][last], -1, 1).astype(float)
     reward = probe.reward(None, action, probe.A @ seen["states"][last] + probe.B @ action)
@@ -295,7 +295,7 @@ def test_statistics_are_running_ones_and_fold_into_a_layer():
 def test_networks_see_observations_by_their_statistics(runs, method):
     """Another unit and another zero of the observations, taken in by the statistics, change nothing."""
     config, state = override(TINY, {"method": method}), runs[method][0][3]
-    env, scale, shift = stable_baselines._environment(config), np.array([50.0, 4.0]), np.array([300.0, -20.0])
+    env, scale, shift = stable_baselines._environment(probe.PROBE), np.array([50.0, 4.0]), np.array([300.0, -20.0])
     n = state.statistics["count"]
     moved = state._replace(
         statistics={
@@ -337,7 +337,7 @@ def test_the_critic_normalises_layers_and_takes_actions_second():
 
 def test_l2_pulls_on_the_critics_hidden_weights_alone(runs):
     config, state = override(TINY, {"method": "ddpg"}), runs["ddpg"][0][3]
-    env = stable_baselines._environment(config)
+    env = stable_baselines._environment(probe.PROBE)
     model = stable_baselines._model(config, env, 0, state)
     env.close()
     critic = model.critic
@@ -372,7 +372,7 @@ def test_the_replay_buffer_forgets_the_oldest_first(monkeypatch):
 
 def test_no_episode_finished_is_no_return():
     config = override(TINY, {"method": "ddpg", "collect.steps": 10})
-    _, row = stable_baselines.step(config, stable_baselines.init(config))
+    _, row = stable_baselines.step(config, probe.PROBE, stable_baselines.init(config, probe.PROBE))
     assert np.isnan(row["return_collected"])
 
 
@@ -388,7 +388,7 @@ def test_progress_is_told_of_both_stages():
 
     config = override(TINY, {"method": "ddpg"})
     states, _ = run(config, 1)
-    _, row = stable_baselines.step(config, states[1], Told())
+    _, row = stable_baselines.step(config, probe.PROBE, states[1], Told())
     assert told == [("learn", 128), 100, 200, ("evaluate", 2)]
     assert row["seconds_collect"] > 0
     assert row["seconds_improve"] > 0
@@ -405,7 +405,7 @@ def test_the_curve_can_be_drawn_without_the_models_columns(runs, tmp_path):
 @METHODS
 def test_the_algorithm_has_the_settings_named(method):
     config = override(TINY, {"method": method})
-    env = stable_baselines._environment(config)
+    env = stable_baselines._environment(probe.PROBE)
     model = stable_baselines._model(config, env, stable_baselines._seed(config, 0, Stage.INIT), None)
     env.close()
     sizes = {name: tuple(x.shape) for name, x in model.policy.named_parameters() if name.endswith("weight")}

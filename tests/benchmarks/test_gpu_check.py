@@ -13,8 +13,12 @@ import numpy as np
 import pytest
 
 import probe
+<<<<<<< HEAD:tests/benchmarks/test_gpu_check.py
 from metrpo import algorithm
 from places import ROOT
+=======
+from metrpo import training
+>>>>>>> 1e8f176 (A task is looked up once, by those who start a run, and passed on: nothing under them asks for it by name):tests/test_gpu_check.py
 
 BENCHMARKS = ROOT / "benchmarks"
 
@@ -85,8 +89,8 @@ def test_a_presets_iterations_are_timed_while_time_is_left(check, monkeypatch):
         time.sleep(0.05)
         return argparse.Namespace(iteration=state.iteration + 1), row
 
-    monkeypatch.setattr(algorithm, "init", lambda config: argparse.Namespace(iteration=0))
-    monkeypatch.setattr(algorithm, "step", step)
+    monkeypatch.setattr(training, "init", lambda config: argparse.Namespace(iteration=0))
+    monkeypatch.setattr(training, "step", step)
     saved: list[dict] = []
     with probe.registered():
         check["stages"]("Probe", "paper", False, 60.0, saved.append)

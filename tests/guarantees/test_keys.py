@@ -12,7 +12,7 @@ import pytest
 
 import metrpo
 import probe
-from metrpo import algorithm, seeds
+from metrpo import algorithm, seeds, training
 from metrpo.config import Config
 from metrpo.presets import override
 
@@ -115,9 +115,9 @@ def test_nothing_random_is_used_twice(options, monkeypatch):
     for name in ("rng_of", "key_of"):
         monkeypatch.setattr(algorithm, name, noted(getattr(seeds, name)))
     config = override(TINY, options)
-    state = algorithm.init(config)
+    state = training.init(config)
     for _ in range(config.iterations):
-        state, _ = algorithm.step(config, state)
+        state, _ = training.step(config, state)
     jax.effects_barrier()
     assert len(trace.drawn) > 50
     assert trace.twice() == []

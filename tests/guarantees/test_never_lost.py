@@ -71,7 +71,7 @@ def taught(monkeypatch):
     """Learning takes no time: it counts the real steps, and keeps what it was given to learn from."""
     given = []
 
-    def learn(config, state, episodes, progress, clock=None, failed=0):
+    def learn(config, task, state, episodes, progress, clock=None, failed=0):
         given.append(episodes)
         steps = state.real_steps + sum(len(e.rewards) for e in episodes)
         row = {"iteration": state.iteration + 1, "real_steps": steps, "return_real": 0.0, "return_real_std": 0.0}
@@ -90,21 +90,21 @@ def test_no_record_costs_what_is_learned(monkeypatch, caplog):
     task = dataclasses.replace(registry.get_task("Probe"), name="Ending", terminated="learned")
     monkeypatch.setitem(registry._TASKS, "Ending", task)
     config = dataclasses.replace(CONFIG, task="Ending")
-    state = algorithm.init(config)
+    state = training.init(config)
     _learn_nothing(monkeypatch)
-    expected, sound = algorithm.step(config, state)
+    expected, sound = training.step(config, state)
 
     def fails(*_):
         raise RuntimeError("no model of it")
 
-    episodes = algorithm.collect(config, state)
+    episodes = algorithm.collect(config, task, state)
     monkeypatch.setattr(Sick, "sickness", staticmethod(lambda start, step: step == 3))
     monkeypatch.setattr(Sick, "close", fails)
     monkeypatch.setattr(algorithm, "diagnose", fails)
     monkeypatch.setattr(algorithm, "end_calibration", fails)
     monkeypatch.setattr(algorithm.scales, "count", fails)
     caplog.clear()
-    found, row = algorithm.learn(config, state, episodes)
+    found, row = algorithm.learn(config, task, state, episodes)
     assert str(found) == str(expected)
     assert list(row) == list(sound)
     unknown = {name for name, value in row.items() if math.isnan(value)} - {"end_recall"}
@@ -171,7 +171,7 @@ def test_an_episode_of_nan_is_left_out_and_never_played_again(tmp_path, taught, 
         return reset(self, seed=seed, options=options)
 
     monkeypatch.setattr(probe.ProbeEnv, "reset", watched)
-    algorithm.collect(CONFIG, algorithm.init(CONFIG))
+    algorithm.collect(CONFIG, registry.get_task("Probe"), training.init(CONFIG))
     second = probe.rollout(probe.PROBE, seeds[1], lambda t, s: np.zeros(2))[0][0, 0]
     monkeypatch.setattr(Sick, "sickness", staticmethod(lambda start, step: start == second and step == 4))
     seeds.clear()
@@ -291,20 +291,22 @@ def long_task(monkeypatch):
 
 def test_only_episodes_longer_than_the_steps_asked_for_are_cut(long_task):
     config = dataclasses.replace(CONFIG, task="Long")
-    state = algorithm.init(config)
-    episodes = algorithm.collect(config, state)
+    state = training.init(config)
+    episodes = algorithm.collect(config, long_task, state)
     assert [len(e.rewards) for e in episodes] == [config.collect.steps]
     assert not episodes[0].terminated
-    assert [len(e.rewards) for e in algorithm.collect(config, state, at_least=100)] == [80, 80]
+    assert [len(e.rewards) for e in algorithm.collect(config, long_task, state, at_least=100)] == [80, 80]
     short = dataclasses.replace(config, collect=dataclasses.replace(config.collect, steps=30), task="Probe")
-    assert [len(e.rewards) for e in algorithm.collect(short, state)] == [20, 20], "a whole one may go beyond"
+    assert [len(e.rewards) for e in algorithm.collect(short, probe.PROBE, state)] == [20, 20], (
+        "a whole one may go beyond"
+    )
 
 
 def test_an_evaluation_ends(long_task, monkeypatch):
     config = dataclasses.replace(CONFIG, task="Long", evaluation_episodes=1000)
     monkeypatch.setattr(algorithm, "EVALUATION_STEPS", 2 * LONG)
-    assert len(algorithm.evaluate(config, long_task, algorithm.init(config).policy, 1)) == 2
-    assert algorithm.evaluate(CONFIG, probe.PROBE, algorithm.init(CONFIG).policy, 1).shape == (1,)
+    assert len(algorithm.evaluate(config, long_task, training.init(config).policy, 1)) == 2
+    assert algorithm.evaluate(CONFIG, probe.PROBE, training.init(CONFIG).policy, 1).shape == (1,)
 
 
 def test_a_request_to_stop_does_not_wait_for_a_long_episode(tmp_path, monkeypatch, capfd):

@@ -149,7 +149,7 @@ def test_a_sick_environment_is_named_with_stage_and_step(clean, monkeypatch, cap
     where = r"reset\(\)" if at is None else f"step {at} of an episode"
     message = f"iteration 2: Probe: {where}: expected finite numbers below 1.7e38 as {what}, got"
     Sick(monkeypatch, what, at, value, episode=2)
-    assert len(algorithm.collect(TINY, clean.states[0])) == 4, "it is left out, and another one played"
+    assert len(algorithm.collect(TINY, probe.PROBE, clean.states[0])) == 4, "it is left out, and another one played"
     assert re.match(f"collect, {message}", caplog.messages[0])
     Sick(monkeypatch, what, at, value, episode=1)
     with pytest.raises(TaskError, match=f"^evaluate, {message}"), finite.naming("evaluate", 2):
@@ -221,8 +221,8 @@ def poisoned(tree, value, leaf=0, at=0):
 
 def going_on(clean, state):
     """The second iteration from another state than the undisturbed run's."""
-    episodes = algorithm.collect(TINY, clean.states[0])
-    return algorithm.learn(TINY, state, episodes)
+    episodes = algorithm.collect(TINY, probe.PROBE, clean.states[0])
+    return algorithm.learn(TINY, probe.PROBE, state, episodes)
 
 
 @pytest.mark.parametrize("value", POISON)
@@ -246,7 +246,7 @@ def test_a_poisoned_policy_is_named_before_anything_is_saved(clean, value):
             with pytest.raises(
                 DivergedError, match=r"^collect, iteration 2: Probe: step 0 .* expected numbers as action"
             ):
-                algorithm.collect(TINY, state)
+                algorithm.collect(TINY, probe.PROBE, state)
     with pytest.raises(
         DivergedError, match=rf"^improve, iteration 2: policy\.layers\[1\]\[1\]: .* got {value} at \[0\]"
     ):
@@ -283,7 +283,7 @@ def test_what_no_stage_has_noticed_is_not_saved(clean, tmp_path, monkeypatch):
 def test_the_other_methods_are_checked_as_they_end_an_iteration(monkeypatch, tmp_path, value):
     config = override(TINY, {"method": "trpo"})
 
-    def step(config, state, progress):
+    def step(config, task, state, progress):
         return state._replace(iteration=1, policy=poisoned(state.policy, value)), {}
 
     monkeypatch.setattr(real_trpo, "step", step)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import probe
 from helpers import linear_ensemble
-from metrpo import algorithm
+from metrpo import training
 from metrpo.model.calibration import calibration, end_calibration
 from metrpo.presets import override, preset
 from metrpo.types import Transitions
@@ -74,7 +74,7 @@ def test_a_run_with_a_learned_end_reports_it(monkeypatch):
     monkeypatch.setitem(registry._TASKS, task.name, task)
     small = {"fit.max_steps": 200, "validate.max_updates": 5, "evaluation_episodes": 1, "collect.max_std": 3.0}
     config = override(dataclasses.replace(preset("Swimmer"), task=task.name), {**probe.LEARN, **small})
-    _, row = algorithm.step(config, algorithm.init(config))
+    _, row = training.step(config, training.init(config))
     assert 0 < row["end_share"] < 0.5
     assert 0 <= row["end_error"] <= 1
     assert {"end_recall", "end_false_alarms"} <= row.keys()

@@ -194,7 +194,7 @@ class State(NamedTuple):
 def test_a_run_remembers_where_its_file_lay(command, tmp_path, monkeypatch):
     write("mine.py", MAKE, horizon=5)
     untrained = State(0, 0, random_policy(0, 3, 1))
-    monkeypatch.setattr("metrpo.algorithm.init", lambda config: untrained)
+    monkeypatch.setattr("metrpo.algorithm.init", lambda config, task: untrained)
     monkeypatch.setattr("metrpo.training.finished", lambda config, state: True)
     command(override(preset("mine.py:make"), {"trust_reward": True}), "run")
     about = json.loads(Path("run/run.json").read_text())

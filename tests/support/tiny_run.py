@@ -73,19 +73,19 @@ def cheap():
     learned, begun = {}, {}
     learn, init, append = algorithm.learn, algorithm.init, EpisodeLog.append
 
-    def learn_once(config, state, episodes, progress, *rest):
+    def learn_once(config, task, state, episodes, progress, *rest):
         key = _content((state, episodes))
         if key not in learned:
-            learned[key] = learn(config, state, episodes, progress, *rest)
+            learned[key] = learn(config, task, state, episodes, progress, *rest)
         else:
             for stage in ("fit", "improve", "evaluate"):
                 progress.stage(stage)
         following, row = learned[key]
         return following, dict(row)
 
-    def init_once(config):
+    def init_once(config, task):
         if config.iterations not in begun:
-            begun[config.iterations] = init(config)
+            begun[config.iterations] = init(config, task)
         return begun[config.iterations]
 
     def counted_append(self, episode):

@@ -6,7 +6,7 @@ import pytest
 from gymnasium.spaces import Box, Dict, Tuple
 
 import metrpo
-from metrpo.run.directory import _interface
+from metrpo import external
 from metrpo.world.interface import of_env
 from metrpo.world.tasks.gymnasium_formulas import KNOWN
 
@@ -77,6 +77,7 @@ def test_parts_of_dicts_and_tuples_are_named_in_state_order():
     assert (shows.action_low, shows.action_high) == ((-1, 0), (1, 5))
 
 
-def test_a_task_that_nobody_knows_has_none():
-    assert _interface("no such task") is None
-    assert _interface("Swimmer") is metrpo.get_task("Swimmer").interface
+def test_a_run_writes_its_tasks_interface_into_the_policys_file(tmp_path):
+    config = metrpo.preset("Swimmer")
+    external.begin(config, tmp_path)
+    assert metrpo.load_policy(tmp_path).info.observation == metrpo.get_task("Swimmer").interface.observation

@@ -13,7 +13,7 @@ from gymnasium.spaces import Box, Dict, Discrete, Tuple
 
 import probe
 from helpers import linear_ensemble, random_ensemble, random_episode
-from metrpo import algorithm, policy_phase, training
+from metrpo import policy_phase, training
 from metrpo.config import CollectConfig, Config
 from metrpo.errors import ConfigError, TaskError
 from metrpo.model.imagine import imagine, outcome, returns_per_model
@@ -24,7 +24,7 @@ from metrpo.world import dataset as datasets
 from metrpo.world import registry, resolve
 from metrpo.world.env_wrapper import Guarded
 from metrpo.world.formula_check import check_formulas
-from metrpo.world.registry import get_task
+from metrpo.world.registry import get_task, task_for
 from metrpo.world.resolve import task_of
 
 
@@ -349,16 +349,16 @@ def test_tasks_with_known_formulas_use_them_unless_told_to_learn(name, sizes, le
     assert (task.state_size, task.action_size, task.horizon) == sizes
     assert task.learned == learned
     assert callable(task.terminated) == (name == "InvertedPendulum-v5")
-    blind = algorithm.task_for(Config(task=name, learn_reward=True))
+    blind = task_for(Config(task=name, learn_reward=True))
     assert blind.learned == ("reward", "end")
-    assert blind is algorithm.task_for(Config(task=name, learn_reward=True)), "another object would be compiled anew"
-    assert algorithm.task_for(Config(task=name)) is task
+    assert blind is task_for(Config(task=name, learn_reward=True)), "another object would be compiled anew"
+    assert task_for(Config(task=name)) is task
 
 
 def test_the_first_state_has_outputs_for_what_is_learned():
     for learn, outputs in ((False, 3), (True, 5)):
         config = override(Config(task="Pendulum-v1", learn_reward=learn), {"ensemble.hidden": (4,)})
-        state = algorithm.init(config)
+        state = training.init(config)
         assert state.networks[-1][0].shape[-1] == state.dataset.train.deltas.shape[1] == outputs
 
 

@@ -13,7 +13,6 @@ from metrpo.errors import TaskError
 from metrpo.run import yardstick_record
 from metrpo.run.directory import RunDirectory
 from metrpo.types import Episode
-from metrpo.world import registry
 from metrpo.world import yardsticks as world
 from tiny_run import CONFIG
 
@@ -49,9 +48,8 @@ def test_long_episodes_are_played_less_often(monkeypatch, horizon, episodes):
     assert seen == 2 * [(episodes, 10_000)]
 
 
-def test_a_run_says_what_evaluation_cuts(monkeypatch, caplog):
-    monkeypatch.setitem(registry._TASKS, "Probe", dataclasses.replace(probe.PROBE, horizon=10_001))
-    training.check(CONFIG)
+def test_a_run_says_what_evaluation_cuts(caplog):
+    training.check(CONFIG, dataclasses.replace(probe.PROBE, horizon=10_001))
     assert "Probe: episodes of up to 10,001 steps: evaluation cuts them after 10,000" in caplog.text
 
 

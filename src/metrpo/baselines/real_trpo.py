@@ -25,7 +25,7 @@ from metrpo.policy.improvers.table import Baseline, batch_of, init_baseline
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.types import Array, Trajectories
-from metrpo.world.registry import get_task
+from metrpo.world.task import Task
 
 _EPISODES = 64
 """Batches are padded to a multiple of so many episodes: where these end early their number changes all the time."""
@@ -40,17 +40,17 @@ class State(NamedTuple):
     baseline: Baseline
 
 
-def init(config: Config) -> State:
+def init(config: Config, task: Task) -> State:
     """The state before the first iteration."""
-    task, p = get_task(config.task), config.policy
+    p = config.policy
     key = key_of(config.seed, 0, Stage.INIT)
     policy = gaussian.init(key, task.state_size, task.action_size, p.hidden, p.initial_std)
     return State(0, 0, policy, init_baseline(config, task.state_size, key_of(config.seed, 0, Stage.IMPROVE)))
 
 
-def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
+def step(config: Config, task: Task, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
     """One update of TRPO on `config.collect.steps` real steps, or on what is left of the budget."""
-    task, iteration, clock = get_task(config.task), state.iteration + 1, Clock()
+    iteration, clock = state.iteration + 1, Clock()
     with clock("collect"):
         enough, at_most = budget.steps_wanted(config, state.real_steps), budget.steps_left(config, state.real_steps)
         progress.stage("collect", enough)

@@ -26,7 +26,7 @@ from metrpo.policy.gaussian import Policy
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, rng_of
 from metrpo.world.env_returns import closing
-from metrpo.world.registry import get_task
+from metrpo.world.task import Task
 
 try:
     import torch
@@ -70,19 +70,16 @@ class State(NamedTuple):
     """DDPG's n transitions, the oldest first: `_REPLAY`, float32, [n, S] twice, [n, A], [n] twice. Empty for PPO."""
 
 
-def init(config: Config) -> State:
-    """The state before the first iteration.
-
-    Raises `TaskError` for an unknown task.
-    """
-    with closing(_environment(config), config.task) as env:
+def init(config: Config, task: Task) -> State:
+    """The state before the first iteration."""
+    with closing(_environment(task), task.name) as env:
         return _state(config, _model(config, env, _seed(config, 0, Stage.INIT), None), 0)
 
 
-def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
+def step(config: Config, task: Task, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
     """One outer iteration: learning for `collect.steps` real steps, or what is left of the budget, in whole updates."""
     iteration, clock = state.iteration + 1, Clock()
-    with closing(_environment(config), config.task) as env, clock("improve"):
+    with closing(_environment(task), task.name) as env, clock("improve"):
         wanted = budget.steps_wanted(config, state.real_steps)
         progress.stage("learn", wanted)
         model = _model(config, env, _seed(config, iteration, Stage.COLLECT), state)
@@ -92,7 +89,7 @@ def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[Sta
         state = _state(config, model, iteration)
     with clock("evaluate"):
         progress.stage("evaluate", config.evaluation_episodes)
-        returns = recorded_returns(config, get_task(config.task), state.policy, iteration)
+        returns = recorded_returns(config, task, state.policy, iteration)
     return state, {
         "iteration": state.iteration,
         "real_steps": state.real_steps,
@@ -125,9 +122,8 @@ class _Watch(BaseCallback):
         self._progress.update(self.num_timesteps - self._steps_before)
 
 
-def _environment(config: Config) -> Monitor:
+def _environment(task: Task) -> Monitor:
     # float32 halves the replay buffer, and is what the networks compute in.
-    task = get_task(config.task)
     space = Box(-np.inf, np.inf, (task.state_size,), np.float32)
     return Monitor(ClockEnds(TransformObservation(task.make_env(), lambda state: state.astype(np.float32), space)))
 
@@ -155,7 +151,7 @@ def _ppo_policy(model: Any) -> Policy:
 
 def _ddpg(config: Config, env: Monitor, seed: int, state: State | None) -> NormedDDPG:
     steps, kept = config.collect.steps, len(state.replay["rewards"]) if state else 0
-    action = np.zeros(get_task(config.task).action_size)
+    action = np.zeros(env.action_space.shape)
     sizes = {"pi": list(config.policy.hidden), "qf": list(defaults.DDPG_CRITIC)}
     return NormedDDPG(
         NormedTD3Policy,

@@ -17,7 +17,7 @@ import numpy as np
 import optax
 
 from metrpo import budget
-from metrpo.algorithm import Row, recorded_returns, task_for
+from metrpo.algorithm import Row, recorded_returns
 from metrpo.baselines import on_policy
 from metrpo.config import Config
 from metrpo.console.progress import SILENT, Progress
@@ -66,9 +66,9 @@ class Path(NamedTuple):
     """[T], 1 within the episode."""
 
 
-def init(config: Config) -> State:
+def init(config: Config, task: Task) -> State:
     """The state before the first iteration."""
-    task, p, e = task_for(config), config.policy, config.ensemble
+    p, e = config.policy, config.ensemble
     if task.reward is None:
         raise ConfigError(f"method: svg needs the reward of {task.name} as a formula, got a task that learns it")
     keys = jax.random.split(key_of(config.seed, 0, Stage.INIT), 3)
@@ -88,9 +88,9 @@ def init(config: Config) -> State:
     )
 
 
-def step(config: Config, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
+def step(config: Config, task: Task, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
     """Episodes of `config.collect.steps` real steps together, each followed by training the model and the policy."""
-    task, iteration, clock = task_for(config), state.iteration + 1, Clock()
+    iteration, clock = state.iteration + 1, Clock()
     rng, key = rng_of(config.seed, iteration, Stage.COLLECT), key_of(config.seed, iteration, Stage.IMPROVE)
     collected: list[Episode] = []
     losses, norms, finite = [], [], []

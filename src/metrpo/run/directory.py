@@ -29,7 +29,7 @@ import numpy as np
 
 from metrpo import config as configs
 from metrpo.config import Config
-from metrpo.errors import ConfigError, RunDirectoryError, TaskError
+from metrpo.errors import ConfigError, RunDirectoryError
 from metrpo.run import yardstick_record
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.curve import draw_curve
@@ -50,7 +50,6 @@ from metrpo.run.metrics import (
 )
 from metrpo.run.policy_file import Interface, Weights, save_policy
 from metrpo.safe_load import text_of
-from metrpo.world.registry import get_task
 
 _log = logging.getLogger("metrpo")
 _KEPT = 2
@@ -91,11 +90,13 @@ class RunDirectory:
     config: Config
     rows: list[Row]
     """Every finished iteration, as in metrics.csv."""
+    interface: Interface | None
+    """What the task's environment shows and takes, for the policy's file; None: unknown."""
     episodes: EpisodeLog
     """Real episodes, on disk as soon as they end."""
 
-    def __init__(self, path: str | Path, config: Config) -> None:
-        self.path, self.config, self.rows = Path(path), config, []
+    def __init__(self, path: str | Path, config: Config, interface: Interface | None = None) -> None:
+        self.path, self.config, self.interface, self.rows = Path(path), config, interface, []
         self._lock = claim(self.path, config)
         self.episodes, self._taken = EpisodeLog(self.path, writer="run"), [0]
         self._opened, self._wall_seconds_before = time.monotonic(), 0.0
@@ -240,7 +241,7 @@ class RunDirectory:
         result = result if result is not None and math.isfinite(result) else None
         progress = (state.iteration, state.real_steps, result)
         origin = getattr(state, "origin", None)  # baselines have none
-        save_policy(self.path, state.policy, self.config.task, *progress, _interface(self.config.task), origin)
+        save_policy(self.path, state.policy, self.config.task, *progress, self.interface, origin)
 
     def _draw_curve(self) -> None:
         title = f"{self.config.task}, {self.config.system}, {self.config.preset}, seed {self.config.seed}"
@@ -289,12 +290,6 @@ def _holds(file: Path, text: str) -> bool:
     with contextlib.suppress(OSError, UnicodeDecodeError):
         return file.read_text() == text
     return False
-
-
-def _interface(task: str) -> Interface | None:
-    with contextlib.suppress(TaskError):  # what is learned here need not be a task that this process knows
-        return get_task(task).interface
-    return None
 
 
 def _number(path: Path) -> int:

@@ -18,7 +18,7 @@ from typing import Any
 
 import jax
 
-from metrpo import algorithm, training
+from metrpo import training
 from metrpo.run.directory import RunDirectory
 from metrpo.run.machine import cores, device_names
 from metrpo.speed import ours, peers
@@ -221,12 +221,12 @@ def _iterations(tell: Tell) -> Iterations:
     jax.clear_caches()
     seconds, outside, counts = [], [], []
     with tempfile.TemporaryDirectory() as scratch, RunDirectory(Path(scratch) / "run", config) as run:
-        state = algorithm.init(config)
+        state = training.init(config)
         while not training.finished(config, state):
             tell(f"outer iteration {state.iteration + 1} of {config.iterations}")
             start = time.perf_counter()
             with compilations() as seen:
-                state, row = algorithm.step(config, state)
+                state, row = training.step(config, state)
                 run.save(state, row)
             seconds.append(time.perf_counter() - start)
             stages = sum(value for name, value in row.items() if name.startswith("seconds_"))

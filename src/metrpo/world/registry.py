@@ -8,6 +8,7 @@ from functools import cache
 
 import gymnasium
 
+from metrpo.config import Config
 from metrpo.errors import TaskError
 from metrpo.world.interface import with_positions
 from metrpo.world.resolve import resolve, task_of
@@ -48,6 +49,15 @@ def get_task(name: str) -> Task:
         f"unknown task {name!r}: {hint}known tasks: {', '.join(_TASKS)} (see: metrpo tasks), any Gymnasium id, "
         "module:name or path/to/file.py:name"
     )
+
+
+def task_for(config: Config) -> Task:
+    """The config's task, its formulas left out where they are to be learned; asked for once, and then passed on.
+
+    Raises `TaskError` as `get_task`.
+    """
+    task = get_task(config.task)
+    return without_formulas(task) if config.learn_reward else task
 
 
 @cache

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import probe
 from helpers import linear_ensemble, on_host, random_policy
-from metrpo import algorithm, policy_phase
+from metrpo import policy_phase, training
 from metrpo.config import AdvantageConfig, Config
 from metrpo.policy import advantage
 from metrpo.policy.improvers.table import batch_of, init_baseline, init_memory
@@ -347,7 +347,7 @@ def test_the_setting_chooses_the_baseline(monkeypatch):
 def test_a_checkpoint_brings_the_network_back(tmp_path):
     config = override(Config("Probe"), {"advantage.baseline": "network", "advantage.value_hidden": (8,)})
     with probe.registered():
-        state = algorithm.init(config)
+        state = training.init(config)
     changed = jax.tree.map(lambda x: np.asarray(x) + 1, state.baseline)
     save_state(tmp_path / "state.npz", state._replace(baseline=changed), {"metrpo": "0"})
     loaded, _ = load_state(tmp_path / "state.npz", state)
