@@ -27,6 +27,7 @@ from metrpo import get_task, policy_phase, preset  # noqa: E402
 from metrpo.model import ensemble as ensembles  # noqa: E402
 from metrpo.model.fit import fit  # noqa: E402
 from metrpo.policy import gaussian  # noqa: E402
+from metrpo.policy.improvers.settings import PhaseSettings  # noqa: E402
 from metrpo.policy.improvers.table import init_memory  # noqa: E402
 from metrpo.policy.value import linear  # noqa: E402
 from metrpo.presets import override  # noqa: E402
@@ -58,21 +59,23 @@ def cost(transitions: int, models: int, width: int, horizon: int, repeats: int =
     networks = ensembles.init(jax.random.key(0), models, task.state_size, task.action_size, (width, width))
     per_pass = max(1, transitions // config.fit.batch_size)
     passes = -(-STEPS // per_pass)
-    settings = dataclasses.replace(config.fit, max_passes=passes, patience=passes, validate_every=min(5, passes))
+    fitting = dataclasses.replace(config.fit, max_passes=passes, patience=passes, validate_every=min(5, passes))
     policy = gaussian.init(jax.random.key(1), task.state_size, task.action_size, config.policy.hidden, 1.0)
-    memory = init_memory(config, policy, linear.init(task.state_size))
+    settings = PhaseSettings.of(config, cut=False)
+    memory = init_memory(settings, policy, linear.init(task.state_size))
     pool = np.asarray(0.1 * train.states[:1000])
-    starts = pool[rng.integers(len(pool), size=(5, policy_phase.rollouts(config, task)))]
+    starts = pool[rng.integers(len(pool), size=(5, policy_phase.rollouts_for(config.imagine.steps, horizon)))]
     seconds: dict[str, list[float]] = {"fit": [], "improve": []}
     for _ in range(repeats + 1):
         start = time.perf_counter()
-        ensemble, info = fit(networks, normaliser, train, validation, settings, jax.random.key(0))
+        ensemble, info = fit(networks, normaliser, train, validation, fitting, jax.random.key(0))
         jax.block_until_ready(ensemble)
         # Whole passes only: brought to the same number of steps.
         seconds["fit"].append((time.perf_counter() - start) * STEPS / (info.passes * per_pass))
         start = time.perf_counter()
-        jax.block_until_ready(policy_phase._updates(task, config, ensemble, policy, memory, starts, jax.random.key(2)))
-        policy_phase.values_of(task, ensemble, policy, pool[: config.validate.starts])
+        simulator = policy_phase.simulator_of(config, task, ensemble)
+        jax.block_until_ready(policy_phase.run_updates(settings, simulator, policy, memory, starts, jax.random.key(2)))
+        policy_phase.values_of(simulator, policy, pool[: config.validate.starts])
         seconds["improve"].append(time.perf_counter() - start)
     return {name: statistics.median(values[1:]) for name, values in seconds.items()}
 

@@ -29,7 +29,7 @@ from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Ensemble
 from metrpo.model.epochs import validation_loss
 from metrpo.model.fit import fit
-from metrpo.model.imagine import imagine
+from metrpo.model.imagine import Simulator, imagine
 from metrpo.policy import gaussian
 from metrpo.policy.improvers import trpo
 from metrpo.policy.improvers.batch import Batch
@@ -103,12 +103,13 @@ def _fit(size: Size, ensemble: Ensemble, train: Transitions) -> Results:
 
 
 def _imagine(task: Any, ensemble: Ensemble, policy: gaussian.Policy, starts: np.ndarray) -> Results:
-    def rollouts(ensemble: Ensemble, policy: gaussian.Policy, starts: np.ndarray, key: Any) -> Any:
-        act = partial(gaussian.sample, policy)
-        return imagine(ensemble, act, task.reward, task.terminated, starts, task.horizon, key)
+    simulator = Simulator(ensemble, task.reward, task.terminated, task.horizon)
 
-    trajectories, _ = jax.jit(rollouts)(ensemble, policy, starts, jax.random.key(1))
-    values = policy_phase.values_of(task, ensemble, policy, starts)
+    def rollouts(simulator: Simulator, policy: gaussian.Policy, starts: np.ndarray, key: Any) -> Any:
+        return imagine(simulator, partial(gaussian.sample, policy), starts, key)
+
+    trajectories, _ = jax.jit(rollouts)(simulator, policy, starts, jax.random.key(1))
+    values = policy_phase.values_of(simulator, policy, starts)
     states = np.asarray(trajectories.states)
     # Changes of state, for the states themselves would hide small ones.
     moved = states - starts

@@ -23,7 +23,7 @@ from metrpo.console.progress import SILENT
 from metrpo.model import ensemble as ensembles
 from metrpo.model.diagnostics import diagnose
 from metrpo.model.ensemble import Ensemble
-from metrpo.policy.improvers.table import init_baseline
+from metrpo.policy.value.table import init_baseline
 from metrpo.presets import override
 from metrpo.run.clock import Clock
 from metrpo.run.directory import RunDirectory
@@ -60,11 +60,13 @@ def phases(config: Config, state: algorithm.State, count: int, fresh: bool, vari
     normaliser = ensembles.normaliser_of(data.train, e.std_floor, e.delta_std_floor, task.unseen)
     ensemble = Ensemble(state.networks, normaliser)
     first = init(config).policy if fresh else state.policy
-    baseline = init_baseline(config, task.state_size, key_of(seed, 0, Stage.IMPROVE))
+    baseline = init_baseline(config.advantage, task.state_size, key_of(seed, 0, Stage.IMPROVE))
     state = state._replace(policy=first, baseline=baseline)
     earned = np.nan
     for number in range(1, count + 1):
-        policy, baseline, info = algorithm._improve(config, task, state, data, ensemble, number, SILENT, Clock())
+        policy, baseline, info = algorithm._improve(
+            config, task, state._replace(iteration=number - 1), ensemble, SILENT, Clock()
+        )
         state = state._replace(policy=policy, baseline=baseline)
         earned = float(np.mean(algorithm.evaluate(config, task, policy, number, origin=state.origin)))
         horizon, key = policy_phase.imagined_horizon(config, task), jax.random.key(seed)

@@ -15,12 +15,13 @@ import pytest
 import probe
 from helpers import linear_ensemble, random_ensemble, random_policy, slow_mean
 from metrpo import algorithm, policy_phase, training
-from metrpo.config import Config
+from metrpo.config import AdvantageConfig, Config
 from metrpo.console.progress import SILENT, Progress
-from metrpo.model.imagine import ImagineInfo, imagine
+from metrpo.model.imagine import ImagineInfo, Simulator, imagine
 from metrpo.policy import gaussian
 from metrpo.policy.improvers import trpo
 from metrpo.policy.improvers.batch import Batch, ImproveInfo
+from metrpo.policy.improvers.settings import PhaseSettings
 from metrpo.policy.improvers.table import Memory
 from metrpo.policy.inputs import folded, inputs_of, normalised
 from metrpo.policy.value import linear
@@ -362,7 +363,7 @@ class Script:
 
     def __init__(self, monkeypatch, tiny, values, **settings):
         self.values, self.blocks, self.fixed_starts, self.starts = values, [], [], []
-        monkeypatch.setattr(policy_phase, "_updates", self._updates)
+        monkeypatch.setattr(policy_phase, "run_updates", self._updates)
         monkeypatch.setattr(policy_phase, "values_of", self._validate)
         self.state = tiny.states[2]._replace(baseline=np.zeros(8, np.float32))
         layers = ((np.zeros((2, 2), np.float32), np.zeros(2, np.float32)),)
@@ -374,9 +375,9 @@ class Script:
     def run(self, config):
         state, clock = self.state, algorithm.Clock()
         ensemble = random_ensemble(0, 2, 2, 2)
-        return algorithm._improve(config, probe.PROBE, state, state.dataset, ensemble, 3, SILENT, clock)
+        return algorithm._improve(config, probe.PROBE, state, ensemble, SILENT, clock)
 
-    def _updates(self, task, config, ensemble, policy, memory, starts, key, inputs):
+    def _updates(self, settings, simulator, policy, memory, starts, key):
         count = len(starts)
         assert np.all(np.asarray(memory.baseline) == self.number(policy)), "baseline and policy go on together"
         self.blocks.append((self.number(policy), count))
@@ -388,7 +389,7 @@ class Script:
         infos = ImproveInfo(zeros + 0.25, zeros, accepted, zeros, zeros), ImagineInfo(zeros, zeros + 0.5, zeros)
         return moved, memory._replace(baseline=memory.baseline + count), infos
 
-    def _validate(self, task, ensemble, policy, starts, config, inputs, baseline):
+    def _validate(self, simulator, policy, starts, advantage, baseline):
         self.fixed_starts.append(starts)
         return np.array(self.values[self.number(policy)], np.float32)
 
@@ -490,9 +491,9 @@ def test_cut_episodes_give_both_policies_the_same_value(tiny, monkeypatch):
     script = Script(monkeypatch, tiny, all_models([5]))
     asked = []
 
-    def value(task, ensemble, policy, starts, config, inputs, baseline):
+    def value(simulator, policy, starts, advantage, baseline):
         asked.append((script.number(policy), float(np.asarray(baseline)[0])))
-        return script._validate(task, ensemble, policy, starts, config, inputs, baseline)
+        return script._validate(simulator, policy, starts, advantage, baseline)
 
     monkeypatch.setattr(policy_phase, "values_of", value)
     short = {"imagine.horizon": 5, "advantage.discount": 0.9, "validate.patience": 10}
@@ -526,10 +527,10 @@ def test_a_phase_on_normalised_states_keeps_the_first_policy(tiny, monkeypatch):
     config, ensemble = override(TINY, {"policy.normalise": True}), random_ensemble(0, 2, 2, 2)
     state, seen = tiny.states[2], []
     monkeypatch.setattr(
-        policy_phase, "values_of", lambda task, ensemble, policy, *rest: seen.append((policy, rest)) or [0.0]
+        policy_phase, "values_of", lambda simulator, policy, *_: seen.append((policy, simulator.inputs)) or [0.0]
     )
-    policy, *_ = algorithm._improve(config, probe.PROBE, state, state.dataset, ensemble, 3, SILENT, algorithm.Clock())
-    (inside, (_, _, inputs, _)), *_ = seen
+    policy, *_ = algorithm._improve(config, probe.PROBE, state, ensemble, SILENT, algorithm.Clock())
+    (inside, inputs), *_ = seen
     rows = state.dataset.train.states
     np.testing.assert_allclose(normalised(inputs, rows).std(0), 1, rtol=1e-3)
     for now in (gaussian.mean(jax.device_get(policy), rows), gaussian.mean(inside, normalised(inputs, rows))):
@@ -598,8 +599,7 @@ def test_starts_may_be_fresh_resets_instead(tiny, monkeypatch):
 
 @pytest.mark.parametrize(("steps", "horizon", "rollouts"), [(100, 20, 5), (101, 20, 6), (1, 20, 1), (50_000, 200, 250)])
 def test_enough_rollouts_for_the_imagined_steps(steps, horizon, rollouts):
-    task = types.SimpleNamespace(horizon=horizon)
-    assert policy_phase.rollouts(override(TINY, {"imagine.steps": steps}), task) == rollouts
+    assert policy_phase.rollouts_for(steps, horizon) == rollouts
 
 
 def test_a_block_is_imagination_advantages_and_trpo_in_turn(tiny):
@@ -610,15 +610,16 @@ def test_a_block_is_imagination_advantages_and_trpo_in_turn(tiny):
     policy = jax.tree.map(jnp.asarray, random_policy(0, 2, 2, hidden=(4,), std=0.5))
     starts = np.random.default_rng(0).uniform(-0.7, 0.7, (2, 5, 2)).astype(np.float32)
     baseline, key = linear.init(2) - 0.1, jax.random.key(3)
-    got_policy, (got_baseline, _), (improved, imagined) = policy_phase._updates(
-        probe.PROBE, config, ensemble, policy, Memory(baseline, ()), starts, key
+    simulator = Simulator(ensemble, probe.reward, None, probe.HORIZON)
+    got_policy, (got_baseline, _), (improved, imagined) = policy_phase.run_updates(
+        PhaseSettings.of(config, cut=False), simulator, policy, Memory(baseline, ()), starts, key
     )
 
     @jax.jit
     def one(policy, baseline, starts, key):
         act = partial(gaussian.sample, policy)
-        t, info = imagine(ensemble, act, probe.reward, None, starts, probe.HORIZON, key)
-        advantages, baseline = linear.advantages_and_value(t, baseline, 1.0, 1.0, 1e-5)
+        t, info = imagine(simulator, act, starts, key)
+        advantages, baseline = linear.advantages_and_value(t, baseline, AdvantageConfig())
         batch = Batch(t.states, t.actions, advantages, t.mask)
         batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(100, *x.shape[2:]), batch)
         policy, improve_info = trpo.improve(policy, batch, config.trpo)

@@ -44,48 +44,45 @@ np.savez(OUT, *jax.tree.leaves(fitted), *jax.tree.leaves(info))
 """
 
 IMPROVE = """
-from metrpo.config import TRPOConfig
-from metrpo.policy import advantage
+from metrpo.config import AdvantageConfig, TRPOConfig
 from metrpo.policy.improvers import trpo
+from metrpo.policy.value import linear
 from metrpo.policy.improvers.batch import Batch
 from metrpo.types import Trajectories
 rng = np.random.default_rng(0)
 policy = random_policy(0, 4, 2, hidden=(8,))
 states, actions = (rng.normal(size=(7, 6, n)).astype(np.float32) for n in (4, 2))
 rewards, mask = rng.normal(size=(7, 6)).astype(np.float32), (rng.uniform(size=(7, 6)) < 0.8).astype(np.float32)
-mesh = devices.mesh(6, "rollouts")
+mesh = devices.mesh(6)
 assert mesh.size == len(jax.devices())
 
 def work(policy, baseline, *given):
     t = Trajectories(*given)
-    advantages, baseline = linear.advantages_and_value(t, baseline, 0.9, 0.9, 0.1, "rollouts")
+    advantages, baseline = linear.advantages_and_value(t, baseline, AdvantageConfig("linear", 0.9, 0.9, 0.1))
     flat = [jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]) for x in (t.states, t.actions, advantages, t.mask)]
-    return advantages, baseline, trpo.improve(policy, Batch(*flat), TRPOConfig(damping=0.1), "rollouts")
+    return advantages, baseline, trpo.improve(policy, Batch(*flat), TRPOConfig(damping=0.1))
 
-share = P(None, "rollouts")
-specs = {"in_specs": (P(), P(), share, share, share, share), "out_specs": (share, P(), P())}
-shared = jax.jit(jax.shard_map(work, mesh=mesh, check_vma=False, **specs))
+share = devices.SECOND
+shared = jax.jit(devices.spread(work, mesh, (P(), P(), share, share, share, share), (share, P(), P())))
 out = shared(policy, linear.init(4), states, actions, rewards, mask)
 assert out[2][1].accepted
 np.savez(OUT, *jax.tree.leaves(out))
 """
 
 IMAGINE = """
-from metrpo.model.imagine import imagine
+from metrpo.model.imagine import Simulator, imagine
 from metrpo.types import Trajectories
 ensemble = random_ensemble(members=3, scale=0.3)
 starts = np.random.default_rng(1).normal(size=(6, 4)).astype(np.float32)
-mesh = devices.mesh(6, "rollouts")
+mesh = devices.mesh(6)
 
 def work(starts):
     act = lambda states, key: jnp.zeros((len(states), 2)) + jax.random.normal(key, (len(states), 2))
-    return imagine(ensemble, act, lambda s, a, n: n[:, 0], None, starts, 5, jax.random.key(0), axis="rollouts")
+    return imagine(Simulator(ensemble, lambda s, a, n: n[:, 0], None, 5), act, starts, jax.random.key(0))
 
-second, first = P(None, "rollouts"), P("rollouts")
+second, first = devices.SECOND, devices.FIRST
 share = Trajectories(second, second, second, second, last=first, going_on=first)
-t, info = jax.jit(
-    jax.shard_map(work, mesh=mesh, in_specs=P("rollouts"), out_specs=(share, P()), check_vma=False)
-)(starts)
+t, info = jax.jit(devices.spread(work, mesh, first, (share, P())))(starts)
 np.testing.assert_array_equal(t.states[0], starts)
 np.testing.assert_allclose(info.mean_return, np.sum(t.rewards) / 6, rtol=1e-5)
 assert (float(info.diverged), float(info.steps)) == (0, 30)
@@ -101,42 +98,41 @@ from metrpo.types import Trajectories
 module.CORE_CACHE = 100  # bytes; the largest layer has more
 policy = random_policy(0, 4, 2, hidden=(8,))
 starts = np.random.default_rng(1).normal(size=(24, 4)).astype(np.float32)
-second, first = P(None, "rollouts"), P("rollouts")
+second, first = devices.SECOND, devices.FIRST
 share = Trajectories(second, second, second, second, last=first, going_on=first)
-specs = {"in_specs": (P(), P("rollouts")), "out_specs": (share, P(), P())}
 divide, divided = module.shared, []
-module.shared = lambda ensemble, axis: divided.append(axis) or divide(ensemble, axis)
+module.shared = lambda ensemble: divided.append(1) or divide(ensemble)
 
-def found(ensemble, devices, few, sampling, curiosity):
+def found(ensemble, count, few, sampling, curiosity):
     module.FEW_ROWS = few
 
     def work(policy, starts):
         def total(policy):
             act = lambda states, key: gaussian.sample(policy, states, key)
             reward = lambda s, a, n: n[:, 0] - a[:, 1]
-            given = act, reward, lambda n: n[:, 0] > 0.5, starts, 5, jax.random.key(0), sampling, "rollouts", curiosity
-            t, info = module.imagine(ensemble, *given)
+            simulator = module.Simulator(ensemble, reward, lambda n: n[:, 0] > 0.5, 5, sampling, curiosity)
+            t, info = module.imagine(simulator, act, starts, jax.random.key(0))
             return jnp.sum(t.rewards * t.mask), (t, info)
 
         gradient, out = jax.grad(total, has_aux=True)(policy)
-        return *out, jax.lax.psum(gradient, "rollouts")
+        return *out, devices.across(gradient)
 
-    mesh = Mesh(np.array(jax.devices()[:devices]), ("rollouts",))
-    out = jax.jit(jax.shard_map(work, mesh=mesh, check_vma=False, **specs))(policy, starts)
+    mesh = Mesh(np.array(jax.devices()[:count]), (devices.AXIS,))
+    out = jax.jit(devices.spread(work, mesh, (P(), first), (share, P(), P())))(policy, starts)
     assert 0 < float(out[1].steps) < 120, "some rollouts ended"
     return jax.device_get(out)
 
-for members, devices, hidden, sampling, curiosity in (
+for members, count, hidden, sampling, curiosity in (
     (3, 4, (16,), "step_rand", 0.0),  # all three cut in four
     (4, 2, (16,), "eps_rand", 0.0),  # two each
     (5, 4, (16, 8, 8, 16), "step_rand", 0.1),
     (3, 2, (16, 16), "step_rand", 0.0),  # one each, and one cut in two
 ):
     ensemble = random_ensemble(members=members, scale=0.3, hidden=hidden)
-    rows = 24 // devices // members  # for each model, on a device with models of its own
-    apart = found(ensemble, devices, rows, sampling, curiosity)
+    rows = 24 // count // members  # for each model, on a device with models of its own
+    apart = found(ensemble, count, rows, sampling, curiosity)
     assert not divided
-    together = found(ensemble, devices, rows + 1, sampling, curiosity)
+    together = found(ensemble, count, rows + 1, sampling, curiosity)
     assert divided
     divided.clear()
     for ours, theirs in zip(jax.tree.leaves(together), jax.tree.leaves(apart), strict=True):
@@ -154,13 +150,13 @@ def work(x):
         time.sleep(65)
         return np.asarray(x)
 
-    first = jax.lax.axis_index("rollouts") == 0
+    first = jax.lax.axis_index(devices.AXIS) == 0
     slow = jax.lax.cond(first, lambda x: jax.pure_callback(slowly, x, x), lambda x: x, x)
-    return jax.lax.psum(slow, "rollouts")
+    return devices.across(slow)
 
-mesh = devices.mesh(2, "rollouts")
+mesh = devices.mesh(2)
 x = jnp.arange(2.0)
-out = jax.jit(jax.shard_map(work, mesh=mesh, in_specs=P("rollouts"), out_specs=P(), check_vma=False))(x)
+out = jax.jit(devices.spread(work, mesh, devices.FIRST, P()))(x)
 np.savez(OUT, out)
 """
 
@@ -210,6 +206,6 @@ def test_a_device_may_wait_for_another_for_long(tmp_path):
 def test_as_many_devices_as_divide_the_work(count, available, size, monkeypatch):
     monkeypatch.setattr(jax, "devices", lambda: [f"device {i}" for i in range(available)])
     monkeypatch.setattr(devices, "Mesh", lambda chosen, axes: (list(chosen), axes))
-    chosen, axes = devices.mesh(count, "members")
+    chosen, axes = devices.mesh(count)
     assert chosen == [f"device {i}" for i in range(size)]
-    assert axes == ("members",)
+    assert axes == (devices.AXIS,)

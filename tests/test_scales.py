@@ -226,7 +226,8 @@ def learn_at_once(monkeypatch):
         normaliser = ensembles.normaliser_of(dataset.train, 1e-8, 1e-8, task.unseen)
         return Ensemble(networks, normaliser), FitInfo(1, two, two, two, two > 1, two > 1)
 
-    def improve(config, task, state, dataset, *_):
+    def improve(config, task, state, *_):
+        dataset = state.dataset
         weights, bias = state.policy.layers[-1]
         seen = dataset.train.states.std() + (dataset.origin - [1e8, 1e8]).sum()
         layers = (*state.policy.layers[:-1], (weights, np.asarray(bias) + np.float32(seen)))

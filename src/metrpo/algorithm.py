@@ -38,9 +38,9 @@ from metrpo.model.ensemble import Ensemble, Networks
 from metrpo.model.fit import FitInfo, fit, refit
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
-from metrpo.policy.improvers.table import Baseline, init_baseline
 from metrpo.policy.inputs import Inputs, folded, inputs_of, unfolded
-from metrpo.policy_phase import PhaseInfo
+from metrpo.policy.value.table import Baseline, init_baseline
+from metrpo.policy_phase import Hooks, PhaseInfo, Starts, simulator_of
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.types import Array, Episode
@@ -103,7 +103,7 @@ def init(config: Config, task: Task) -> State:
         policy=policy,
         previous_policy=policy,
         networks=_fresh_networks(config, task, ensemble_key),
-        baseline=init_baseline(config, task.state_size, key_of(config.seed, 0, Stage.IMPROVE)),
+        baseline=init_baseline(config.advantage, task.state_size, key_of(config.seed, 0, Stage.IMPROVE)),
         dataset=_logged(config, task),
     )
 
@@ -264,7 +264,7 @@ def learn(
         if state.iteration == 0 and (inputs := _inputs(config, task, dataset)):
             # A fresh policy's weights are meant for normalised states; by what, only the first data say.
             state = state._replace(policy=folded(state.policy, inputs))
-        policy, baseline, improved = _improve(config, task, state, dataset, ensemble, iteration, progress, clock)
+        policy, baseline, improved = _improve(config, task, state._replace(dataset=dataset), ensemble, progress, clock)
         advice = "the run was resumed from, or became, a state that cannot go on: use smaller steps or start anew"
         require_finite("improve", iteration, advice, policy=policy, baseline=baseline)
     following = State(
@@ -290,7 +290,7 @@ def learn(
         collected,
         fitted,
         improved,
-        policy_phase.is_cut(config, task) or task.horizon > RECORDED,
+        policy_phase.imagined_horizon(config, task) < task.horizon or task.horizon > RECORDED,
     )
     row |= {"failed_episodes": failed, "failed_evaluation": failed_evaluation(task, returns)}
     row |= {"unfit_dimensions": recorded("unfit_dimensions", iteration, unfit, math.nan)}
@@ -386,21 +386,17 @@ def _named(members: np.ndarray) -> str:
 
 
 def _improve(
-    config: Config,
-    task: Task,
-    state: State,
-    dataset: Dataset,
-    ensemble: Ensemble,
-    iteration: int,
-    progress: Progress,
-    clock: Clock,
+    config: Config, task: Task, state: State, ensemble: Ensemble, progress: Progress, clock: Clock
 ) -> tuple[Policy, Baseline, PhaseInfo]:
+    iteration, dataset = state.iteration + 1, state.dataset
     rng, starts = rng_of(config.seed, iteration, Stage.IMPROVE), dataset.starts
+    simulator = simulator_of(config, shifted(task, dataset.origin), ensemble, _inputs(config, task, dataset))
     if config.imagine.start == "anywhere":
         starts = dataset.train.states
     if config.imagine.start == "reset":
         with naming("improve", iteration):
-            starts = real.reset_states(task, max(config.validate.starts, policy_phase.rollouts(config, task)), rng)
+            rollouts = policy_phase.rollouts_for(config.imagine.steps, simulator.horizon)
+            starts = real.reset_states(task, max(config.validate.starts, rollouts), rng)
         starts = relative(starts, dataset.origin).astype(np.float32)
 
     def oracle(policy: Policy) -> float:
@@ -408,19 +404,17 @@ def _improve(
         # others than the record's, which would else be a selected maximum.
         return float(np.mean(recorded_returns(config, task, policy, iteration, Stage.ORACLE, dataset.origin)))
 
+    def tell(updates: int, accepted: int, value: float) -> None:
+        progress.update(updates, f"accepted {accepted}, imagined return {value:.2f}")
+
     return policy_phase.improve(
         config,
-        shifted(task, dataset.origin),
-        ensemble,
+        simulator,
         _with_std(config, state),
         state.baseline,
-        starts,
-        rng,
+        Starts(starts, rng),
         key_of(config.seed, iteration, Stage.IMPROVE),
-        clock,
-        lambda updates, accepted, value: progress.update(updates, f"accepted {accepted}, imagined return {value:.2f}"),
-        oracle,
-        _inputs(config, task, dataset),
+        Hooks(clock, tell, oracle),
     )
 
 

@@ -6,30 +6,29 @@ The paper's Algorithm 2, lines 6 to 10 (section 5, "Policy Optimization" and "Po
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from dataclasses import replace
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache, partial
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 
 from metrpo import devices
-from metrpo.config import Config, PolicyConfig
+from metrpo.config import AdvantageConfig, Config
+from metrpo.devices import FIRST, SECOND, WHOLE
 from metrpo.model.ensemble import Ensemble, with_products
-from metrpo.model.imagine import ImagineInfo, imagine, returns_per_model
+from metrpo.model.imagine import ImagineInfo, Simulator, imagine, returns_per_model
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers.batch import ImproveInfo
-from metrpo.policy.improvers.table import IMPROVERS, Baseline, Memory, init_memory, values_at_cut
+from metrpo.policy.improvers.settings import PhaseSettings
+from metrpo.policy.improvers.table import IMPROVERS, Memory, init_memory
 from metrpo.policy.inputs import Inputs, folded, normalised, unfolded
 from metrpo.policy.stopping import RULES, Evidence, improved
+from metrpo.policy.value.table import VALUE_FUNCTIONS, Baseline
 from metrpo.types import Act, Array, Trajectories
 from metrpo.world.task import Task
-
-AXIS = "rollouts"
-"""Imagined rollouts are what devices share."""
 
 
 class PhaseInfo(NamedTuple):
@@ -51,65 +50,79 @@ class PhaseInfo(NamedTuple):
     """Share of imagined rollouts, mean over the updates."""
 
 
+class Starts(NamedTuple):
+    """Where imagined episodes start."""
+
+    pool: np.ndarray
+    """[E, S]"""
+    rng: np.random.Generator
+
+    def draw(self, *shape: int) -> np.ndarray:
+        """[*shape, S], with replacement."""
+        return self.pool[self.rng.integers(len(self.pool), size=shape)]
+
+
+class Hooks(NamedTuple):
+    """What a phase asks of, and tells, those around it."""
+
+    clock: Callable[[str], AbstractContextManager[None]] = lambda stage: nullcontext()
+    """Takes the time of a stage."""
+    on_validation: Callable[[int, int, float], None] = lambda updates, accepted, value: None
+    """(updates, updates accepted, value of the accepted policy), after every validation."""
+    oracle: Callable[[Policy], float] = lambda policy: np.nan
+    """A policy's real return, for the rule that asks for it."""
+
+
 def improve(
     config: Config,
-    task: Task,
-    ensemble: Ensemble,
+    simulator: Simulator,
     policy: Policy,
-    baseline: Array,
-    pool: np.ndarray,
-    rng: np.random.Generator,
+    baseline: Baseline,
+    starts: Starts,
     key: Array,
-    clock: Callable[[str], AbstractContextManager[None]],
-    on_validation: Callable[[int, int, float], None],
-    oracle: Callable[[Policy], float],
-    inputs: Inputs | None = None,
-) -> tuple[Policy, Array, PhaseInfo]:
-    """Improves `policy` in the ensemble and returns the last accepted policy, the baseline and what happened.
+    hooks: Hooks,
+) -> tuple[Policy, Baseline, PhaseInfo]:
+    """Improves `policy` in the simulator and returns the last accepted policy, the baseline and what happened.
 
-    Updates come in blocks of `config.validate.every`, each validated on the same start states. Imagined episodes start
-    in states drawn from `pool` [E, S] by `rng`; `on_validation(updates, updates accepted, value)` follows every one.
-    `oracle` gives a policy's real return, for the rule that asks for it.
+    Updates come in blocks of `config.validate.every`, each validated on the same start states.
     """
-    rule = RULES[config.validate.rule]
-    ensemble = ensemble._replace(networks=with_products(ensemble.networks, config.imagine.products))
-    fixed_starts = pool[rng.integers(len(pool), size=config.validate.starts)]
-
-    config = _cut_short(config, task)
+    rule, settings, inputs = RULES[config.validate.rule], PhaseSettings.of(config, simulator.cut), simulator.inputs
+    fixed_starts = starts.draw(config.validate.starts)
+    rollouts = rollouts_for(config.imagine.steps, simulator.horizon)
 
     def raw(policy: Policy) -> Policy:
         return policy if inputs is None else folded(policy, inputs)
 
     def valued(policy: Policy) -> np.ndarray:
-        return values_of(task, ensemble, policy, fixed_starts, config, inputs, memory.baseline)
+        return values_of(simulator, policy, fixed_starts, settings.advantage, memory.baseline)
 
     def evidence(policy: Policy, imagined: np.ndarray) -> Evidence:
-        return Evidence(valued(policy), imagined, cache(lambda: oracle(raw(policy))))
+        return Evidence(valued(policy), imagined, cache(lambda: hooks.oracle(raw(policy))))
 
     policy = policy if inputs is None else unfolded(policy, inputs)
-    memory = init_memory(config, policy, baseline)
+    memory = init_memory(settings, policy, baseline)
     accepted, reference, kept = policy, evidence(policy, np.array([-np.inf])), memory.baseline
     updates = accepted_at = 0
     infos: list[tuple[ImproveInfo, ImagineInfo]] = []
     agreed: list[np.ndarray] = []
     while updates - accepted_at < config.validate.patience and updates < config.validate.max_updates:
         block = min(config.validate.every, config.validate.max_updates - updates)
-        starts = pool[rng.integers(len(pool), size=(block, rollouts(config, task)))]
-        policy, memory, info = _updates(
-            task, config, ensemble, policy, memory, starts, jax.random.fold_in(key, updates), inputs
+        batches = starts.draw(block, rollouts)
+        policy, memory, info = run_updates(
+            settings, simulator, policy, memory, batches, jax.random.fold_in(key, updates)
         )
         infos.append(jax.device_get(info))
         updates += block
-        with clock("validate"):
+        with hooks.clock("validate"):
             found = evidence(policy, _last_return(infos[-1][1]))
-            if config.imagine.horizon is not None:
+            if simulator.cut:
                 # The value at the cut has changed with the baseline: both policies are held against the new one.
                 reference = reference._replace(values=valued(accepted))
         verdict = rule.decide(rule.evidence(found), rule.evidence(reference), config.validate)
         agreed.append(improved(found.values, reference.values))
         if verdict:
             accepted, reference, kept, accepted_at = policy, found, memory.baseline, updates
-        on_validation(updates, accepted_at, float(np.mean(reference.values)))
+        hooks.on_validation(updates, accepted_at, float(np.mean(reference.values)))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jax.device_get(kept))):
         kept = memory.baseline  # what the run was resumed with is no place to go back to
     improve_info, imagine_info = jax.tree.map(lambda *xs: np.concatenate(xs), *infos)
@@ -129,9 +142,19 @@ def improve(
     )
 
 
-def rollouts(config: Config, task: Task) -> int:
-    """Imagined episodes per update: enough for `imagine.steps` steps."""
-    return -(-config.imagine.steps // imagined_horizon(config, task))
+def simulator_of(config: Config, task: Task, ensemble: Ensemble, inputs: Inputs | None = None) -> Simulator:
+    """The simulator that `config` makes of a fitted ensemble and the task's formulas."""
+    horizon = imagined_horizon(config, task)
+    return Simulator(
+        ensemble._replace(networks=with_products(ensemble.networks, config.imagine.products)),
+        task.reward,
+        task.terminated,
+        horizon,
+        sampling=config.imagine.sampling,
+        disagreement=config.imagine.disagreement,
+        cut=horizon < task.horizon,
+        inputs=inputs,
+    )
 
 
 def imagined_horizon(config: Config, task: Task) -> int:
@@ -139,15 +162,9 @@ def imagined_horizon(config: Config, task: Task) -> int:
     return min(config.imagine.horizon or task.horizon, task.horizon)
 
 
-def is_cut(config: Config, task: Task) -> bool:
-    """Whether imagined episodes end before the task's do, and are valued there."""
-    return imagined_horizon(config, task) < task.horizon
-
-
-def _cut_short(config: Config, task: Task) -> Config:
-    """The config with an imagined horizon only where it cuts episodes: nothing follows a true end."""
-    horizon = imagined_horizon(config, task) if is_cut(config, task) else None
-    return replace(config, imagine=replace(config.imagine, horizon=horizon))
+def rollouts_for(steps: int, horizon: int) -> int:
+    """Imagined episodes of `horizon` steps per update: enough for `steps` steps."""
+    return -(-steps // horizon)
 
 
 def _last_return(imagined: ImagineInfo) -> np.ndarray:
@@ -155,98 +172,83 @@ def _last_return(imagined: ImagineInfo) -> np.ndarray:
     return np.where(imagined.diverged[-1:] < 1, imagined.mean_return[-1:], np.nan)
 
 
-@partial(jax.jit, static_argnames=("task", "config", "mesh"))
+def run_updates(
+    settings: PhaseSettings, simulator: Simulator, policy: Policy, memory: Memory, starts: np.ndarray, key: Array
+) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
+    """Policy updates in one compiled call, one for each batch of start states [updates, N, S]."""
+    mesh, keys = devices.mesh(starts.shape[1]), jax.random.split(key, len(starts))
+    simulator, policy, memory = devices.copied((simulator, policy, memory), mesh)
+    return _compiled_updates(settings, mesh, simulator, policy, memory, starts, keys)
+
+
+@partial(jax.jit, static_argnames=("settings", "mesh"))
 def _compiled_updates(
-    task: Task,
-    config: Config,
+    settings: PhaseSettings,
     mesh: Mesh,
-    ensemble: Ensemble,
+    simulator: Simulator,
     policy: Policy,
     memory: Memory,
     starts: Array,
     keys: Array,
-    inputs: Inputs | None,
 ) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
-    """Policy updates in one compiled call, one for each batch of start states [updates, N, S], shared by `mesh`."""
-    improver = IMPROVERS[config.improver]
+    improver = IMPROVERS[settings.improver]
 
     def updates(
-        ensemble: Ensemble, policy: Policy, memory: Memory, starts: Array, keys: Array, inputs: Inputs | None
+        simulator: Simulator, policy: Policy, memory: Memory, starts: Array, keys: Array
     ) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
-        def simulate(act: Act, starts: Array, key: Array) -> tuple[Trajectories, ImagineInfo]:
-            ends, sampling = task.terminated, config.imagine.sampling
-            curiosity, horizon = config.imagine.disagreement, imagined_horizon(config, task)
-            rollouts, info = imagine(
-                ensemble, _seeing(act, inputs), task.reward, ends, starts, horizon, key, sampling, AXIS, curiosity
-            )
-            if inputs is not None:
-                states, last = (normalised(inputs, x) for x in (rollouts.states, rollouts.last))
-                rollouts = rollouts._replace(states=states, last=last)
-            return rollouts, info
-
         def update(
             carry: tuple[Policy, Memory], given: tuple[Array, Array]
         ) -> tuple[tuple[Policy, Memory], tuple[ImproveInfo, ImagineInfo]]:
-            policy, memory, infos = improver(config, simulate, *carry, *given, AXIS)
+            policy, memory, infos = improver(settings, partial(_simulate, simulator), *carry, *given)
             return (policy, memory), infos
 
         (policy, memory), infos = jax.lax.scan(update, (policy, memory), (starts, keys))
         return policy, memory, infos
 
-    same = PartitionSpec()
-    return jax.shard_map(
-        updates,
-        mesh=mesh,
-        in_specs=(same, same, same, PartitionSpec(None, AXIS), same, same),
-        out_specs=same,
-        check_vma=False,
-    )(ensemble, policy, memory, starts, keys, inputs)
+    shared = devices.spread(updates, mesh, (WHOLE, WHOLE, WHOLE, SECOND, WHOLE), WHOLE)
+    after: tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]] = shared(simulator, policy, memory, starts, keys)
+    return after
 
 
-def _seeing(act: Act, inputs: Inputs | None) -> Act:
-    return act if inputs is None else lambda states, key: act(normalised(inputs, states), key)
+def _simulate(simulator: Simulator, act: Act, starts: Array, key: Array) -> tuple[Trajectories, ImagineInfo]:
+    """Imagined episodes as the policy sees them."""
+    inputs = simulator.inputs
+    if inputs is None:
+        return imagine(simulator, act, starts, key)
+    rollouts, info = imagine(simulator, lambda states, key: act(normalised(inputs, states), key), starts, key)
+    states, last = (normalised(inputs, x) for x in (rollouts.states, rollouts.last))
+    return rollouts._replace(states=states, last=last), info
 
 
-def _updates(
-    task: Task,
-    config: Config,
-    ensemble: Ensemble,
+def values_of(
+    simulator: Simulator,
     policy: Policy,
-    memory: Memory,
     starts: np.ndarray,
-    key: Array,
-    inputs: Inputs | None = None,
-) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
-    # What cannot change the compiled code (seed, budget, ...) must not cause a compilation: it is set to a constant.
-    relevant = Config(
-        task=task.name,
-        improver=config.improver,
-        imagine=config.imagine,
-        policy=PolicyConfig(mean_penalty=config.policy.mean_penalty),
-        advantage=config.advantage,
-        trpo=config.trpo,
-        gradient=config.gradient,
-        ppo=config.ppo,
-    )
-    mesh, keys = devices.mesh(starts.shape[1], AXIS), jax.random.split(key, len(starts))
-    ensemble, policy, memory, inputs = devices.copied((ensemble, policy, memory, inputs), mesh)
-    return _compiled_updates(task, relevant, mesh, ensemble, policy, memory, starts, keys, inputs)
+    advantage: AdvantageConfig | None = None,
+    baseline: Baseline = None,
+) -> np.ndarray:
+    """[K]: mean return of the deterministic policy from `starts` [N, S] in each model alone.
+
+    Undiscounted over the whole horizon; where the simulator cuts episodes off, discounted as `advantage` says, with the
+    value that `baseline` gives to their last state.
+    """
+    mesh = devices.mesh(len(starts))
+    simulator, policy, baseline = devices.copied((simulator, policy, baseline), mesh)
+    return np.asarray(_compiled_values(advantage, mesh, simulator, policy, starts, baseline))
 
 
-@partial(jax.jit, static_argnames=("task", "mesh", "config"))
-def _compiled_validate(
-    task: Task,
+@partial(jax.jit, static_argnames=("advantage", "mesh"))
+def _compiled_values(
+    advantage: AdvantageConfig | None,
     mesh: Mesh,
-    config: Config,
-    ensemble: Ensemble,
+    simulator: Simulator,
     policy: Policy,
     starts: Array,
-    inputs: Inputs | None,
     baseline: Baseline,
 ) -> Array:
-    horizon, curiosity = imagined_horizon(config, task), config.imagine.disagreement
+    def values(simulator: Simulator, policy: Policy, starts: Array, baseline: Baseline) -> Array:
+        inputs = simulator.inputs
 
-    def values(ensemble: Ensemble, policy: Policy, starts: Array, inputs: Inputs | None, baseline: Baseline) -> Array:
         def seen(states: Array) -> Array:
             return states if inputs is None else normalised(inputs, states)
 
@@ -254,37 +256,12 @@ def _compiled_validate(
             return gaussian.mean(policy, seen(states))
 
         def after(states: Array) -> Array:
+            assert advantage is not None
             flat = seen(states).reshape(-1, states.shape[-1])
-            return values_at_cut(config, baseline, flat).reshape(states.shape[:-1])
+            return VALUE_FUNCTIONS[advantage.baseline].at_cut(baseline, flat).reshape(states.shape[:-1])
 
         # Whole episodes are judged by what they earn, undiscounted; cut ones by what the updates improve.
-        cut = (config.advantage.discount, after) if is_cut(config, task) else ()
-        mine = returns_per_model(ensemble, act, task.reward, task.terminated, starts, horizon, curiosity, *cut)
-        return jax.lax.pmean(mine, AXIS)
+        cut = (advantage.discount, after) if simulator.cut and advantage is not None else ()
+        return jax.lax.pmean(returns_per_model(simulator, act, starts, *cut), devices.AXIS)
 
-    same = PartitionSpec()
-    return jax.shard_map(
-        values, mesh=mesh, in_specs=(same, same, PartitionSpec(AXIS), same, same), out_specs=same, check_vma=False
-    )(ensemble, policy, starts, inputs, baseline)
-
-
-def values_of(
-    task: Task,
-    ensemble: Ensemble,
-    policy: Policy,
-    starts: np.ndarray,
-    config: Config | None = None,
-    inputs: Inputs | None = None,
-    baseline: Baseline = None,
-) -> np.ndarray:
-    """[K]: mean return of the deterministic policy from `starts` [N, S] in each model alone, as `config` imagines.
-
-    Undiscounted over the task's horizon; where the config cuts episodes off before, discounted, with the value that
-    `baseline` gives to their last state. Rewards hold the models' disagreement where the config asks for it.
-    """
-    config = config or Config(task=task.name)
-    relevant = Config(task=task.name, imagine=config.imagine, advantage=config.advantage)
-    mesh = devices.mesh(len(starts), AXIS)
-    given = devices.copied((ensemble, policy, inputs, baseline), mesh)
-    ensemble, policy, inputs, baseline = given
-    return np.asarray(_compiled_validate(task, mesh, relevant, ensemble, policy, starts, inputs, baseline))
+    return devices.spread(values, mesh, (WHOLE, WHOLE, FIRST, WHOLE), WHOLE)(simulator, policy, starts, baseline)

@@ -277,8 +277,9 @@ def test_the_value_network_learns_the_returns_to_go():
     config = override(SVG, {"svg.value_steps": 4000, "svg.horizon": "1"})
     state = value_gradients.init(config, probe.PROBE)
     normaliser = random_ensemble(0, members=1, state_size=2, action_size=2).normaliser
+    settings = value_gradients.PolicySettings(config.svg, config.gradient, config.advantage.discount)
     value, _ = jax.jit(value_gradients._train_value, static_argnums=0)(
-        config, normaliser, state.value, state.value_moments, path
+        settings, normaliser, state.value, state.value_moments, path
     )
     to_go = np.cumsum(path.rewards[::-1])[::-1]
     got = value_gradients._value(value, normaliser, path.states[:-1], jnp.arange(12))

@@ -13,12 +13,8 @@ import numpy as np
 import pytest
 
 import probe
-<<<<<<< HEAD:tests/benchmarks/test_gpu_check.py
-from metrpo import algorithm
-from places import ROOT
-=======
 from metrpo import training
->>>>>>> 1e8f176 (A task is looked up once, by those who start a run, and passed on: nothing under them asks for it by name):tests/test_gpu_check.py
+from places import ROOT
 
 BENCHMARKS = ROOT / "benchmarks"
 

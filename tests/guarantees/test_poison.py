@@ -16,14 +16,16 @@ import probe
 from helpers import random_policy
 from metrpo import algorithm, finite, policy_phase, training
 from metrpo.baselines import real_trpo
-from metrpo.config import Config
+from metrpo.config import AdvantageConfig, Config
 from metrpo.console.progress import SILENT
 from metrpo.errors import DivergedError, TaskError
 from metrpo.model import fit as fitting
-from metrpo.model.imagine import ImagineInfo, imagine, returns_per_model
-from metrpo.policy.improvers.table import IMPROVERS, init_baseline, init_memory
+from metrpo.model.imagine import ImagineInfo, Simulator, imagine, returns_per_model
+from metrpo.policy.improvers.settings import PhaseSettings
+from metrpo.policy.improvers.table import IMPROVERS, init_memory
 from metrpo.policy.stopping import RULES, Evidence
 from metrpo.policy.value import linear
+from metrpo.policy.value.table import init_baseline
 from metrpo.presets import override
 from metrpo.run import directory
 from metrpo.run.metrics import completed, read_metrics
@@ -394,10 +396,9 @@ def test_a_learning_rate_far_too_large_is_said_so(tmp_path):
 
 
 def in_imagination(clean, ensemble, settings=None):
-    state = clean.states[0]
-    config = override(TINY, settings or {})
+    state = clean.states[0]._replace(dataset=clean.states[1].dataset)
     return algorithm._improve(
-        config, probe.PROBE, state, clean.states[1].dataset, ensemble, 2, SILENT, algorithm.Clock()
+        override(TINY, settings or {}), probe.PROBE, state._replace(iteration=1), ensemble, SILENT, algorithm.Clock()
     )
 
 
@@ -454,8 +455,8 @@ def test_a_reward_that_explodes_is_a_diverged_rollout(clean):
         def reward(state, action, following):
             return jnp.where(state[..., 0] > 0, scale, 1.0)
 
-        imagined = imagine(still, act, reward, None, starts, 5, jax.random.key(0))
-        return imagined, returns_per_model(still, act, reward, None, starts, 5)
+        simulator = Simulator(still, reward, None, 5)
+        return imagine(simulator, act, starts, jax.random.key(0)), returns_per_model(simulator, act, starts)
 
     compiled = jax.jit(both)
     for value in (*POISON, 1e13, -1e13):
@@ -474,7 +475,8 @@ def test_the_largest_finite_batch_is_still_one(clean):
     rewards = np.where(rng.uniform(size=(200, 100)) < 0.5, -0.99e12, 0.99e12).astype(np.float32)
     states = rng.uniform(-1e6, 1e6, (200, 100, 2)).astype(np.float32)
     rollouts = Trajectories(states, states, rewards, np.ones_like(rewards), states[0], np.ones(100, np.float32))
-    got = jax.jit(lambda t: linear.advantages_and_value(t, jnp.zeros(8), 0.99, 0.95, 1e-5))(rollouts)
+    config = AdvantageConfig("linear", 0.99, 0.95)
+    got = jax.jit(lambda t: linear.advantages_and_value(t, jnp.zeros(8), config))(rollouts)
     assert sound(got)
     assert np.std(got[0]) == pytest.approx(1, rel=1e-3)
 
@@ -499,6 +501,8 @@ def updates():
             {"advantage.baseline": kind, "ppo.epochs": 2, "ppo.minibatches": 2, "advantage.value_steps": 5},
         )
 
+        settings = PhaseSettings.of(config, cut=False)
+
         def update(policy, memory, poison, mask):
             def simulate(act, starts, key):
                 states = jnp.broadcast_to(starts, (6, *starts.shape)) * (1 + jnp.arange(6.0)[:, None, None])
@@ -511,10 +515,10 @@ def updates():
                 return Trajectories(states, actions, rewards, whole, states[-1], mask), info
 
             starts = np.random.default_rng(0).uniform(-1, 1, (8, 2)).astype(np.float32)
-            return IMPROVERS[name](config, simulate, policy, memory, starts, jax.random.key(3), None)
+            return IMPROVERS[name](settings, simulate, policy, memory, starts, jax.random.key(3))
 
         policy = jax.tree.map(jnp.asarray, random_policy(0, 2, 2, (4,)))
-        memory = init_memory(config, policy, init_baseline(config, 2, jax.random.key(1)))
+        memory = init_memory(settings, policy, init_baseline(config.advantage, 2, jax.random.key(1)))
         compiled = jax.jit(update)
         # Adam has momentum from here on: a step that is refused must not be taken by that.
         policy, memory, (info, _) = compiled(policy, memory, 1.0, np.ones(8, np.float32))
@@ -567,9 +571,10 @@ def test_a_step_out_of_the_finite_numbers_is_not_made(name):
         ones = jnp.ones((3, 4))
         return Trajectories(states, actions, -jnp.sum(actions**2, -1), ones, starts, ones[0]), ImagineInfo(0, 0, 12)
 
+    settings = PhaseSettings.of(config, cut=False)
     policy = jax.tree.map(jnp.asarray, random_policy(0, 2, 2, (4,), scale=5.0))
-    memory = init_memory(config, policy, init_baseline(config, 2, jax.random.key(1)))
-    update = jax.jit(partial(IMPROVERS[name], config, simulate, axis=None))
+    memory = init_memory(settings, policy, init_baseline(config.advantage, 2, jax.random.key(1)))
+    update = jax.jit(partial(IMPROVERS[name], settings, simulate))
     for _ in range(8):
         starts = np.random.default_rng(0).normal(size=(4, 2)).astype(np.float32)
         policy, memory, (info, _) = update(policy, memory, starts, jax.random.key(0))

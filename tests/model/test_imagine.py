@@ -14,7 +14,7 @@ import probe
 from helpers import linear_ensemble, on_host, random_ensemble, random_normaliser, random_policy, slow_delta, slow_mean
 from metrpo.model import imagine as imagining
 from metrpo.model.ensemble import Ensemble
-from metrpo.model.imagine import imagine, returns_per_model
+from metrpo.model.imagine import Simulator, imagine, returns_per_model
 from metrpo.model.sampling import Keys, model_choice, step_rand
 from metrpo.policy import gaussian
 
@@ -23,22 +23,25 @@ KEY = jax.random.key(0)
 
 @on_host(static_argnames=("terminated", "horizon"))
 def imagined(ensemble, policy, starts, key, terminated=None, horizon=probe.HORIZON):
-    return imagine(ensemble, partial(gaussian.sample, policy), probe.reward, terminated, starts, horizon, key)
+    simulator = Simulator(ensemble, probe.reward, terminated, horizon)
+    return imagine(simulator, partial(gaussian.sample, policy), starts, key)
 
 
 @on_host(static_argnames=("reward", "terminated", "horizon"))
 def imagined_without_policy(ensemble, starts, key, reward, terminated=None, horizon=10):
-    return imagine(ensemble, lambda s, k: jnp.zeros((len(s), 1)), reward, terminated, starts, horizon, key)
+    simulator = Simulator(ensemble, reward, terminated, horizon)
+    return imagine(simulator, lambda s, k: jnp.zeros((len(s), 1)), starts, key)
 
 
 @on_host(static_argnames=("terminated", "horizon"))
 def returns(ensemble, policy, starts, terminated=None, horizon=probe.HORIZON):
-    return returns_per_model(ensemble, partial(gaussian.mean, policy), probe.reward, terminated, starts, horizon)
+    simulator = Simulator(ensemble, probe.reward, terminated, horizon)
+    return returns_per_model(simulator, partial(gaussian.mean, policy), starts)
 
 
 @on_host(static_argnames=("reward", "terminated", "horizon"))
 def returns_without_policy(ensemble, starts, reward, terminated=None, horizon=10):
-    return returns_per_model(ensemble, lambda s: 0 * s, reward, terminated, starts, horizon)
+    return returns_per_model(Simulator(ensemble, reward, terminated, horizon), lambda s: 0 * s, starts)
 
 
 model_choices = jax.jit(jax.vmap(model_choice, (0, None, None)), static_argnums=(1, 2))
@@ -153,8 +156,9 @@ def test_the_last_step_is_followed_by_a_discounted_value():
             else:
                 slow[k, n] += 0.9**4 * 7 * state[1]
     act, after = partial(gaussian.mean, policy), lambda states: 7 * states[..., 1]
-    got = jax.jit(lambda e, s: returns_per_model(e, act, probe.reward, probe.beyond, s, 4, 0.0, 0.9, after))
-    np.testing.assert_allclose(got(ensemble, starts), slow.mean(1), rtol=1e-3)
+    got = jax.jit(lambda simulator, s: returns_per_model(simulator, act, s, 0.9, after))
+    simulator = Simulator(ensemble, probe.reward, probe.beyond, 4)
+    np.testing.assert_allclose(got(simulator, starts), slow.mean(1), rtol=1e-3)
 
 
 def growing(factors):
@@ -306,7 +310,7 @@ def test_step_rand_is_compute_all_then_pick(count, members):
 
 
 def test_the_sampling_stands_in_the_table():
-    assert imagining.SAMPLINGS["step_rand"] is step_rand
+    assert imagining.SAMPLINGS["step_rand"].draw is step_rand
 
 
 # ---------------------------------------------------------------- exploration by disagreement
@@ -331,8 +335,9 @@ def test_curiosity_adds_disagreement_to_rewards_and_values():
     ensemble = random_ensemble(1, members=3, state_size=2, action_size=2, scale=0.3)
     policy, starts = random_policy(2, 2, 2), probe.starts(4).astype(np.float32)
     act = partial(gaussian.sample, policy)
-    run = jax.jit(lambda c: imagine(ensemble, act, probe.reward, None, starts, 6, KEY, curiosity=c), static_argnums=0)
-    (plain, _), (curious, info) = run(0.0), run(0.5)
+    plainly, curiously = (Simulator(ensemble, probe.reward, None, 6, disagreement=c) for c in (0.0, 0.5))
+    run = jax.jit(lambda simulator: imagine(simulator, act, starts, KEY))
+    (plain, _), (curious, info) = run(plainly), run(curiously)
     np.testing.assert_array_equal(plain.states, curious.states)
     spread = [
         [slow_disagreement(ensemble, s, np.clip(a, -1, 1)) for s, a in zip(*row, strict=True)]
@@ -341,7 +346,7 @@ def test_curiosity_adds_disagreement_to_rewards_and_values():
     np.testing.assert_allclose(curious.rewards - plain.rewards, 0.5 * np.array(spread), atol=1e-4)
     assert float(info.mean_return) == pytest.approx(float(curious.rewards.sum(0).mean()), rel=1e-4)
     mean = partial(gaussian.mean, policy)
-    value = jax.jit(lambda c: returns_per_model(ensemble, mean, probe.reward, None, starts, 6, c), static_argnums=0)
+    value = jax.jit(lambda simulator: returns_per_model(simulator, mean, starts))
     expected = np.zeros(3)
     for k in range(3):
         for state in starts.astype(float):
@@ -349,4 +354,4 @@ def test_curiosity_adds_disagreement_to_rewards_and_values():
                 action = np.clip(slow_mean(policy, state), -1, 1)
                 expected[k] += 0.5 * slow_disagreement(ensemble, state, action) / len(starts)
                 state = state + slow_delta(ensemble, k, state, action)
-    np.testing.assert_allclose(value(0.5) - value(0.0), expected, atol=1e-4)
+    np.testing.assert_allclose(value(curiously) - value(plainly), expected, atol=1e-4)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import types
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -13,7 +15,7 @@ from metrpo.policy.value import linear
 from metrpo.types import Trajectories
 
 T, N, S = 12, 5, 3
-discounted_returns, gae, standardise, features, fit_baseline, advantages_and_baseline = (
+discounted_returns, gae, standardise, features, fit_baseline = (
     on_host()(f)
     for f in (
         advantage.discounted_returns,
@@ -21,9 +23,17 @@ discounted_returns, gae, standardise, features, fit_baseline, advantages_and_bas
         advantage.standardise,
         linear.features,
         linear.fit,
-        linear.advantages_and_value,
     )
 )
+
+
+@on_host(static_argnames="cut")
+def advantages_and_baseline(trajectories, baseline, discount, gae_lambda, ridge, cut=False):
+    """Compiled once for all discounts: the config would hold them fast."""
+    config = types.SimpleNamespace(discount=discount, gae_lambda=gae_lambda, ridge=ridge)
+    return linear.advantages_and_value(trajectories, baseline, config, cut=cut)
+
+
 seeds = st.integers(0, 2**31 - 1)
 shares = st.sampled_from([0.0, 0.3, 0.9, 0.99, 1.0])
 
@@ -245,7 +255,7 @@ def test_the_value_at_the_cut_is_that_of_the_endless_episode():
     states = rng.normal(size=(6, 40, 2)).astype(np.float32)
     ones = np.ones((5, 40), np.float32)
     endless = Trajectories(states[:5], np.zeros((5, 40, 1), np.float32), ones, ones, states[5], ones[0])
-    cut = on_host(static_argnames="cut")(linear.advantages_and_value)
+    cut = advantages_and_baseline
     baseline = np.zeros(8, np.float32)
     for _ in range(60):
         _, baseline = cut(endless, baseline, discount, 1.0, 1e-5, cut=True)

@@ -12,14 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-<<<<<<< HEAD:tests/run/test_directory.py
 from blank_run import CONFIG, DETERMINISTIC, a_row, a_state, train
-from metrpo import training
-from metrpo.config import TRPOConfig, to_json
-=======
 from metrpo import algorithm, training
 from metrpo.config import TRPOConfig, to_json
->>>>>>> 1e8f176 (A task is looked up once, by those who start a run, and passed on: nothing under them asks for it by name):tests/test_directory.py
 from metrpo.console.progress import Progress
 from metrpo.errors import RunDirectoryError
 from metrpo.run import directory as module

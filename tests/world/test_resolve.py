@@ -16,7 +16,7 @@ from helpers import linear_ensemble, random_ensemble, random_episode
 from metrpo import policy_phase, training
 from metrpo.config import CollectConfig, Config
 from metrpo.errors import ConfigError, TaskError
-from metrpo.model.imagine import imagine, outcome, returns_per_model
+from metrpo.model.imagine import Simulator, imagine, outcome, returns_per_model
 from metrpo.model.sampling import SAMPLINGS
 from metrpo.presets import override, preset
 from metrpo.world import collect as real
@@ -417,8 +417,9 @@ def test_a_learned_reward_and_end_are_followed_in_imagination():
     model = model._replace(networks=networks, normaliser=jax.tree.map(np.float32, wider))
     starts, key = probe.starts(6).astype(np.float32), jax.random.key(0)
     act = lambda s, k=None: 0.1 * s[..., ::-1]  # noqa: E731
-    t, info = jax.jit(lambda m, s, k: imagine(m, act, None, "learned", s, 20, k))(model, starts, key)
-    values = jax.jit(lambda m, s: returns_per_model(m, act, None, "learned", s, 20))(model, starts)
+    simulator = Simulator(model, None, "learned", 20)
+    t, info = jax.jit(lambda m, s, k: imagine(m, act, s, k))(simulator, starts, key)
+    values = jax.jit(lambda m, s: returns_per_model(m, act, s))(simulator, starts)
     totals = []
     for i, start in enumerate(starts.astype(float)):
         state, total, length = start, 0.0, 0
@@ -449,7 +450,8 @@ def test_every_sampling_carries_the_learned_outputs_along(sampling):
     )
     starts = np.zeros((6, 2), np.float32)
     act = lambda s, k: jax.numpy.zeros((len(s), 2))  # noqa: E731
-    t, _ = jax.jit(lambda k: imagine(narrow, act, None, "learned", starts, 5, k, sampling))(jax.random.key(1))
+    simulator = Simulator(narrow, None, "learned", 5, sampling)
+    t, _ = jax.jit(lambda k: imagine(simulator, act, starts, k))(jax.random.key(1))
     assert t.rewards.shape == (5, 6)
     assert np.isfinite(t.rewards).all()
     assert np.std(t.rewards) > 0
@@ -501,13 +503,13 @@ def test_short_imagined_episodes_need_a_discount(blind):
 
 def test_short_imagined_episodes_start_anywhere_and_are_more(blind, monkeypatch):
     config = override(LEARN, {**SHORT, "iterations": 1, "imagine.steps": 100, "validate.max_updates": 5})
-    pools, updates = [], policy_phase._updates
+    pools, updates = [], policy_phase.run_updates
 
-    def spied(task, config, ensemble, policy, memory, starts, *rest):
+    def spied(settings, simulator, policy, memory, starts, key):
         pools.append(np.asarray(starts))
-        return updates(task, config, ensemble, policy, memory, starts, *rest)
+        return updates(settings, simulator, policy, memory, starts, key)
 
-    monkeypatch.setattr(policy_phase, "_updates", spied)
+    monkeypatch.setattr(policy_phase, "run_updates", spied)
     state = training.train(config)
     assert pools[0].shape == (5, 20, 2), "20 episodes of 5 steps"
     seen = {row.tobytes() for row in state.dataset.train.states}

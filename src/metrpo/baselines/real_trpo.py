@@ -15,13 +15,14 @@ from metrpo import budget
 from metrpo.algorithm import Row, recorded_returns
 from metrpo.baselines import on_policy
 from metrpo.baselines.on_policy import Drawn
-from metrpo.config import Config
+from metrpo.config import AdvantageConfig, Config, TRPOConfig
 from metrpo.console.progress import SILENT, Progress
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers import trpo
 from metrpo.policy.improvers.batch import ImproveInfo
-from metrpo.policy.improvers.table import Baseline, batch_of, init_baseline
+from metrpo.policy.improvers.table import batch_of
+from metrpo.policy.value.table import Baseline, init_baseline
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.types import Array, Trajectories
@@ -45,7 +46,7 @@ def init(config: Config, task: Task) -> State:
     p = config.policy
     key = key_of(config.seed, 0, Stage.INIT)
     policy = gaussian.init(key, task.state_size, task.action_size, p.hidden, p.initial_std)
-    return State(0, 0, policy, init_baseline(config, task.state_size, key_of(config.seed, 0, Stage.IMPROVE)))
+    return State(0, 0, policy, init_baseline(config.advantage, task.state_size, key_of(config.seed, 0, Stage.IMPROVE)))
 
 
 def step(config: Config, task: Task, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
@@ -58,11 +59,11 @@ def step(config: Config, task: Task, state: State, progress: Progress = SILENT) 
         drawn = on_policy.collect(task, state.policy, enough, rng, progress.update, longest, at_most)
     with clock("improve"):
         progress.stage("improve")
-        # Other settings, the seed say, must not cause a compilation.
-        relevant = Config(task=task.name, advantage=config.advantage, trpo=config.trpo)
         batch = trajectories(drawn, task.horizon)
         key = key_of(config.seed, iteration, Stage.IMPROVE)
-        policy, baseline, info = jax.device_get(_update(relevant, state.policy, state.baseline, batch, key))
+        policy, baseline, info = jax.device_get(
+            _update(config.advantage, config.trpo, state.policy, state.baseline, batch, key)
+        )
     with clock("evaluate"):
         progress.stage("evaluate", config.evaluation_episodes)
         returns = recorded_returns(config, task, policy, iteration)
@@ -100,10 +101,15 @@ def trajectories(drawn: Drawn, horizon: int) -> Trajectories:
     )
 
 
-@partial(jax.jit, static_argnames="config")
+@partial(jax.jit, static_argnames=("advantage", "config"))
 def _update(
-    config: Config, policy: Policy, baseline: Baseline, rollouts: Trajectories, key: Array
+    advantage: AdvantageConfig,
+    config: TRPOConfig,
+    policy: Policy,
+    baseline: Baseline,
+    rollouts: Trajectories,
+    key: Array,
 ) -> tuple[Policy, Baseline, ImproveInfo]:
-    batch, baseline = batch_of(config, rollouts, baseline, key)
-    policy, info = trpo.improve(policy, batch, config.trpo)
+    batch, baseline = batch_of(advantage, rollouts, baseline, key)
+    policy, info = trpo.improve(policy, batch, config)
     return policy, baseline, info

@@ -8,6 +8,7 @@ one step of it followed by a learned value.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ import optax
 from metrpo import budget
 from metrpo.algorithm import Row, recorded_returns
 from metrpo.baselines import on_policy
-from metrpo.config import Config
+from metrpo.config import Config, FitConfig, GradientConfig, SVGConfig
 from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import ConfigError
 from metrpo.model import ensemble as ensembles
@@ -36,6 +37,15 @@ from metrpo.world import dataset as datasets
 from metrpo.world.task import Task
 
 _VALUE_HIDDEN = (64, 64)
+
+
+@dataclass(frozen=True)
+class PolicySettings:
+    """What decides the compiled update of the policy."""
+
+    svg: SVGConfig
+    gradient: GradientConfig
+    discount: float
 
 
 class State(NamedTuple):
@@ -204,29 +214,29 @@ def _normaliser(config: Config, task: Task, replay: Transitions) -> Normaliser:
 
 
 def _fit(config: Config, state: State, normaliser: Normaliser, replay: Transitions, key: Array) -> tuple[State, Array]:
-    settings = (config.fit.learning_rate, config.fit.batch_size, config.fit.loss_units, config.svg.model_steps)
-    networks, moments, loss = _train_model(settings, state.networks, state.model_moments, normaliser, replay, key)
+    learned = state.networks, state.model_moments
+    networks, moments, loss = _train_model(config.fit, config.svg.model_steps, *learned, normaliser, replay, key)
     return state._replace(networks=networks, model_moments=moments), loss
 
 
-@partial(jax.jit, static_argnames="settings")
+@partial(jax.jit, static_argnames=("config", "steps"))
 def _train_model(
-    settings: tuple[float, int, str, int],
+    config: FitConfig,
+    steps: int,
     networks: Networks,
     moments: Any,
     normaliser: Normaliser,
     replay: Transitions,
     key: Array,
 ) -> tuple[Networks, Any, Array]:
-    learning_rate, batch_size, loss_units, steps = settings
-    optimizer = optax.adam(learning_rate)
+    optimizer = optax.adam(config.learning_rate)
 
     def loss(networks: Networks, *batch: Array) -> Array:
-        return jnp.mean(loss_of(Ensemble(networks, normaliser), loss_units, *batch))
+        return jnp.mean(loss_of(Ensemble(networks, normaliser), config.loss_units, *batch))
 
     def step(carry: tuple[Networks, Any], key: Array) -> tuple[tuple[Networks, Any], Array]:
         networks, moments = carry
-        index = minibatch(key, jnp.arange(1), batch_size, replay.size)
+        index = minibatch(key, jnp.arange(1), config.batch_size, replay.size)
         now, gradient = jax.value_and_grad(loss)(networks, *(jnp.take(x, index, axis=0) for x in replay[:3]))
         change, moments = optimizer.update(gradient, moments)
         return (optax.apply_updates(networks, change), moments), now
@@ -238,9 +248,8 @@ def _train_model(
 def _improve(
     config: Config, task: Task, state: State, normaliser: Normaliser, path: Path
 ) -> tuple[State, Array, Array]:
-    relevant = Config(task=task.name, gradient=config.gradient, svg=config.svg, advantage=config.advantage)
     learned, norm, made = _train_policy(
-        relevant,
+        PolicySettings(config.svg, config.gradient, config.advantage.discount),
         task,
         Ensemble(state.networks, normaliser),
         (state.policy, state.policy_moments, state.value, state.value_moments),
@@ -251,25 +260,27 @@ def _improve(
     return changed, norm, made
 
 
-@partial(jax.jit, static_argnames=("config", "task"))
+@partial(jax.jit, static_argnames=("settings", "task"))
 def _train_policy(
-    config: Config, task: Task, ensemble: Ensemble, learned: tuple[Policy, Any, Policy, Any], path: Path
+    settings: PolicySettings, task: Task, ensemble: Ensemble, learned: tuple[Policy, Any, Policy, Any], path: Path
 ) -> tuple[tuple[Policy, Any, Policy, Any], Array, Array]:
     policy, moments, value, value_moments = learned
-    discount = config.advantage.discount
-    if config.svg.horizon == "1":
-        value, value_moments = _train_value(config, ensemble.normaliser, value, value_moments, path)
+    discount = settings.discount
+    if settings.svg.horizon == "1":
+        value, value_moments = _train_value(settings, ensemble.normaliser, value, value_moments, path)
         gradient = value_gradient(task, ensemble, policy, path, discount, value)
     else:
         gradient = value_gradient(task, ensemble, policy, path, discount)
-    policy, moments, made = ascend(policy, moments, gradient, config.gradient)
+    policy, moments, made = ascend(policy, moments, gradient, settings.gradient)
     return (policy, moments, value, value_moments), optax.tree.norm(gradient), made
 
 
-def _train_value(config: Config, normaliser: Normaliser, value: Policy, moments: Any, path: Path) -> tuple[Policy, Any]:
+def _train_value(
+    settings: PolicySettings, normaliser: Normaliser, value: Policy, moments: Any, path: Path
+) -> tuple[Policy, Any]:
     """The value network fitted to the path's own returns to go, which are the policy's."""
-    optimizer = optax.adam(config.svg.value_learning_rate)
-    returns = discounted_returns(path.rewards[:, None], path.mask[:, None], config.advantage.discount)[:, 0]
+    optimizer = optax.adam(settings.svg.value_learning_rate)
+    returns = discounted_returns(path.rewards[:, None], path.mask[:, None], settings.discount)[:, 0]
 
     def loss(value: Policy) -> Array:
         errors = _value(value, normaliser, path.states[:-1], jnp.arange(path.mask.size)) - returns
@@ -279,4 +290,4 @@ def _train_value(config: Config, normaliser: Normaliser, value: Policy, moments:
         change, moments = optimizer.update(jax.grad(loss)(carry[0]), carry[1])
         return optax.apply_updates(carry[0], change), moments
 
-    return jax.lax.fori_loop(0, config.svg.value_steps, step, (value, moments))
+    return jax.lax.fori_loop(0, settings.svg.value_steps, step, (value, moments))

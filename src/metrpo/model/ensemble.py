@@ -34,6 +34,10 @@ class Ensemble(NamedTuple):
         """What the networks say, each member to its own batch: [K, B, I] -> [K, B, D]."""
         return network_outputs(self.networks, x)
 
+    def first(self) -> Ensemble:
+        """The first member as an ensemble of one."""
+        return self._replace(networks=tuple((weights[:1], biases[:1]) for weights, biases in self.networks))
+
 
 def init(
     key: Array, members: int, state_size: int, action_size: int, hidden: tuple[int, ...], learned: int = 0
@@ -98,6 +102,9 @@ class Predictor(Protocol):
     def outputs(self, x: Array) -> Array:
         """What the networks say, each member to its own batch: [K, B, I] -> [K, B, D]."""
 
+    def first(self) -> Predictor:
+        """The first member as an ensemble of one."""
+
 
 def predict(ensemble: Predictor, states: Array, actions: Array) -> Array:
     """Next states and what else is learned, each member for its own batch: [K, B, S], [K, B, A] -> [K, B, D]."""
@@ -128,11 +135,6 @@ def network_outputs(networks: Networks, x: Array) -> Array:
 def layer_outputs(x: Array, weights: Array, biases: Array) -> Array:
     """Before the nonlinearity, each member for its own batch: [K, B, I] -> [K, B, O]."""
     return _product(x, weights) + biases
-
-
-def first_member(ensemble: Ensemble) -> Ensemble:
-    """The first model as an ensemble of one."""
-    return ensemble._replace(networks=tuple((weights[:1], biases[:1]) for weights, biases in ensemble.networks))
 
 
 def with_products(networks: Networks, dtype: str) -> Networks:

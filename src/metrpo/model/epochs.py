@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh
 
 from metrpo.config import FitConfig
+from metrpo.devices import AXIS, FIRST, WHOLE, spread
 from metrpo.model.ensemble import Ensemble, Networks, predict_delta, with_products
 from metrpo.types import Array, Normaliser, Transitions
 
@@ -25,6 +26,14 @@ class _Training(NamedTuple):
     networks: Networks
     optimizer: optax.OptState
     train_loss: Array
+
+
+class FitData(NamedTuple):
+    """What a fit learns from, and is judged by."""
+
+    normaliser: Normaliser
+    train: Transitions
+    validation: Transitions
 
 
 class Progress(NamedTuple):
@@ -67,40 +76,21 @@ def validation_loss(ensemble: Ensemble, validation: Transitions, loss_units: str
 
 @partial(jax.jit, static_argnames=("config", "mesh"), donate_argnums=0)
 def train_and_validate(
-    at: Progress,
-    normaliser: Normaliser,
-    train: Transitions,
-    validation: Transitions,
-    config: FitConfig,
-    mesh: Mesh,
-    key: Array,
-    steps: Array,
-    passes: Array,
+    at: Progress, data: FitData, config: FitConfig, mesh: Mesh, key: Array, steps: Array, passes: Array
 ) -> Progress:
     """`steps` minibatches for every member, each device of `mesh` with its own members, then one validation."""
-    whole = PartitionSpec()
-    own = jax.tree.map(lambda x: PartitionSpec(*mesh.axis_names) if x.ndim else whole, at)
-    block = partial(_block, config=config, axis=mesh.axis_names[0])
-    specs = (own, whole, whole, whole, whole, whole, whole)
-    shared = jax.shard_map(block, mesh=mesh, in_specs=specs, out_specs=own, check_vma=False)
-    return shared(at, normaliser, train, validation, key, steps, passes)
+    own = jax.tree.map(lambda x: FIRST if x.ndim else WHOLE, at)
+    block = spread(partial(_block, config=config), mesh, (own, WHOLE, WHOLE, WHOLE, WHOLE), own)
+    after: Progress = block(at, data, key, steps, passes)
+    return after
 
 
-def _block(
-    at: Progress,
-    normaliser: Normaliser,
-    train: Transitions,
-    validation: Transitions,
-    key: Array,
-    steps: Array,
-    passes: Array,
-    config: FitConfig,
-    axis: str,
-) -> Progress:
+def _block(at: Progress, data: FitData, key: Array, steps: Array, passes: Array, config: FitConfig) -> Progress:
     """One device's share of `train_and_validate`."""
+    normaliser, train, validation = data
     optimizer = optimizer_of(config)
     members = at.best_loss.shape[0]
-    first = jax.lax.axis_index(axis) * members
+    first = jax.lax.axis_index(AXIS) * members
     block_key = jax.random.fold_in(key, passes)
 
     def total_loss(networks: Networks, *batch: Array) -> tuple[Array, Array]:

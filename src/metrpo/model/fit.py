@@ -15,7 +15,7 @@ import numpy as np
 from metrpo import devices
 from metrpo.config import FitConfig
 from metrpo.model.ensemble import Ensemble, Networks
-from metrpo.model.epochs import Progress, optimizer_of, train_and_validate, validation_loss
+from metrpo.model.epochs import FitData, Progress, optimizer_of, train_and_validate, validation_loss
 from metrpo.types import Array, Normaliser, Transitions
 
 
@@ -58,9 +58,8 @@ def fit(
     loss = validation_loss(Ensemble(networks, normaliser), validation, config.loss_units)
     at = Progress(networks, optimizer.init(networks), networks, loss, jnp.zeros(loss.shape, jnp.int32), loss)
     at = jax.tree.map(jnp.copy, at)  # its buffers are given away below, the caller's are not
-    mesh = devices.mesh(loss.size, "members")
-    at, normaliser = devices.shared(at, mesh), devices.copied(normaliser, mesh)
-    train, validation = devices.copied(train, mesh), devices.copied(validation, mesh)
+    mesh = devices.mesh(loss.size)
+    at, data = devices.shared(at, mesh), devices.copied(FitData(normaliser, train, validation), mesh)
     # At least one step a pass: the first iterations of a small task may have fewer transitions than a minibatch.
     steps_per_pass = max(1, int(train.size) // config.batch_size)
     most = config.max_passes * steps_per_pass
@@ -71,12 +70,12 @@ def fit(
         steps += block
         passes = -(-steps // steps_per_pass)
         counts = jnp.int32(block), jnp.int32(passes)
-        at = train_and_validate(at, normaliser, train, validation, config, mesh, key, *counts)
+        at = train_and_validate(at, data, config, mesh, key, *counts)
         on_validation(passes, at.best_loss)
     diverged = ~(_finite(at.networks) & np.isfinite(at.train_loss))
     lost = ~(_finite(at.best_networks) & np.isfinite(at.best_loss)) | (diverged & (np.asarray(at.best_pass) == 0))
     info = FitInfo(passes, at.best_loss, at.train_loss, at.best_pass, diverged, lost)
-    return Ensemble(at.best_networks, normaliser), info
+    return Ensemble(at.best_networks, data.normaliser), info
 
 
 def refit(

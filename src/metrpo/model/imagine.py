@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from metrpo.devices import across, share_of
+from metrpo.devices import across, is_spread, share_of, sharers
 from metrpo.model.ensemble import Ensemble, Predictor, predict, predict_delta
 from metrpo.model.model_parallel import can_share, shared
 from metrpo.model.sampling import SAMPLINGS, Keys, for_all
+from metrpo.policy.inputs import Inputs
 from metrpo.types import Act, Array, Trajectories
 
 Reward = Callable[[Array, Array, Array], Array]
@@ -24,6 +26,29 @@ CORE_CACHE, FEW_ROWS = 2**21, 100
 """Where a layer has as many bytes of weights as the first, and a core fewer rows for each model than the second, one
 core alone reads more than it computes: the cores of a CPU then share the models instead of the rollouts
 (docs/performance.md, "Models shared by the cores")."""
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Simulator:
+    """The learned environment in which a policy acts: the models, and how they are used.
+
+    A pytree; its static fields decide compiled code.
+    """
+
+    ensemble: Ensemble
+    reward: Reward | None = field(metadata={"static": True})
+    """None: learned."""
+    terminated: Terminated | None = field(metadata={"static": True})
+    horizon: int = field(metadata={"static": True})
+    """Steps of an episode."""
+    sampling: str = field(default="step_rand", metadata={"static": True})
+    disagreement: float = field(default=0.0, metadata={"static": True})
+    """Rewards hold this times the models' disagreement."""
+    cut: bool = field(default=False, metadata={"static": True})
+    """Whether its episodes end before the task's do, and are valued there."""
+    inputs: Inputs | None = None
+    """How the policy sees the states; None: as they are."""
 
 
 class ImagineInfo(NamedTuple):
@@ -60,30 +85,19 @@ def disagreement(ensemble: Predictor, states: Array, actions: Array) -> Array:
     return jnp.mean(jnp.std(deltas, axis=0), axis=-1)
 
 
-def imagine(
-    ensemble: Ensemble,
-    act: Act,
-    reward: Reward | None,
-    terminated: Terminated | None,
-    starts: Array,
-    horizon: int,
-    key: Array,
-    sampling: str = "step_rand",
-    axis: str | None = None,
-    curiosity: float = 0.0,
-) -> tuple[Trajectories, ImagineInfo]:
-    """Imagined episodes of `horizon` steps from `starts` [N, S].
+def imagine(simulator: Simulator, act: Act, starts: Array, key: Array) -> tuple[Trajectories, ImagineInfo]:
+    """Imagined episodes from `starts` [N, S], in which `act` sees the states as they are.
 
-    Actions are clipped to [-1, 1] for dynamics and reward, and recorded as drawn. Rewards hold `curiosity` times the
-    models' disagreement. With `axis`, `starts` are this device's share of the batch; the trajectories stay with it, the
-    info is about all (see `metrpo.devices`). A CPU's devices share the models too, where these are too wide for a core.
+    Actions are clipped to [-1, 1] for dynamics and reward, and recorded as drawn. Where devices share the batch
+    (`devices.spread`), the trajectories are this device's, and the info is about all. A CPU's devices share the models
+    too, where these are too wide for a core.
     """
-    rows = starts.shape[0]
-    models: Predictor = ensemble
-    if axis is not None and _shares_models(ensemble, rows, sampling, axis):
-        models = shared(ensemble, axis)
-    key = share_of(key, axis)
-    next_state = SAMPLINGS[sampling]
+    rows, horizon, bonus = starts.shape[0], simulator.horizon, simulator.disagreement
+    sampling = SAMPLINGS[simulator.sampling]
+    models: Predictor = simulator.ensemble
+    if is_spread() and sampling.of_drawn_models and _shares_models(simulator.ensemble, rows):
+        models = shared(simulator.ensemble)
+    key = share_of(key)
     episode_key = jax.random.fold_in(key, horizon)
 
     def step(carry: tuple[Array, Array, Array], key: Array) -> tuple[tuple[Array, Array, Array], Trajectories]:
@@ -91,10 +105,10 @@ def imagine(
         action_key, model_key = jax.random.split(key)
         actions = act(states, action_key)
         clipped = jnp.clip(actions, -1.0, 1.0)
-        predicted = next_state(models, states, clipped, Keys(model_key, episode_key))
-        following, rewards, ended = outcome(reward, terminated, states, clipped, predicted)
-        if curiosity:
-            rewards = rewards + curiosity * disagreement(models, states, clipped)
+        predicted = sampling.draw(models, states, clipped, Keys(model_key, episode_key))
+        following, rewards, ended = outcome(simulator.reward, simulator.terminated, states, clipped, predicted)
+        if bonus:
+            rewards = rewards + bonus * disagreement(models, states, clipped)
         bad = ~_sound(following, rewards)
         recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive)
         diverged = diverged | (bad & (alive > 0))
@@ -108,19 +122,19 @@ def imagine(
     (last, alive, diverged), trajectories = jax.lax.scan(step, carry, jax.random.split(key, horizon))
     mask = trajectories.mask * (1.0 - diverged)
     total, lost, rollouts, steps = across(
-        (jnp.sum(trajectories.rewards * mask), jnp.sum(diverged), jnp.float32(rows), jnp.sum(mask)), axis
+        (jnp.sum(trajectories.rewards * mask), jnp.sum(diverged), jnp.float32(rows), jnp.sum(mask))
     )
     info = ImagineInfo(total / jnp.maximum(rollouts - lost, 1), lost / rollouts, steps)
     return trajectories._replace(mask=mask, last=last, going_on=alive * (1.0 - diverged)), info
 
 
-def _shares_models(ensemble: Ensemble, rows: int, sampling: str, axis: str) -> bool:
+def _shares_models(ensemble: Ensemble, rows: int) -> bool:
     """Whether cores of a CPU with `rows` rollouts each do better to share the models (`CORE_CACHE`)."""
-    if jax.default_backend() != "cpu" or sampling not in ("step_rand", "eps_rand"):
+    if jax.default_backend() != "cpu":
         return False
     largest = max(weights[0].nbytes for weights, _ in ensemble.networks)
     few = rows < FEW_ROWS * ensemble.members
-    return largest >= CORE_CACHE and few and can_share(ensemble.networks, jax.lax.axis_size(axis))
+    return largest >= CORE_CACHE and few and can_share(ensemble.networks, sharers())
 
 
 def _sound(states: Array, rewards: Array) -> Array:
@@ -129,32 +143,29 @@ def _sound(states: Array, rewards: Array) -> Array:
 
 
 def returns_per_model(
-    ensemble: Ensemble,
+    simulator: Simulator,
     act: Callable[[Array], Array],
-    reward: Reward | None,
-    terminated: Terminated | None,
     starts: Array,
-    horizon: int,
-    curiosity: float = 0.0,
     discount: float = 1.0,
     after: Callable[[Array], Array] | None = None,
 ) -> Array:
-    """[K]: mean return of the deterministic policy `act` in `horizon` steps from `starts` [N, S], in each model alone.
+    """[K]: mean return of the deterministic policy `act` from `starts` [N, S], in each model alone.
 
-    Rewards hold `curiosity` times the models' disagreement. What follows the last step is worth `after` of its state,
+    What follows the last step is worth `after` of its state,
     [..., S] -> [...]; without `after`, nothing.
 
     NaN for a model in which any rollout diverged: such a model cannot vouch for the policy.
     """
+    ensemble, horizon, bonus = simulator.ensemble, simulator.horizon, simulator.disagreement
 
     def step(carry: tuple[Array, Array, Array], weight: Array) -> tuple[tuple[Array, Array, Array], None]:
         states, alive, total = carry
         actions = jnp.clip(act(states), -1.0, 1.0)
         predicted = predict(ensemble, states, actions)
-        following, rewards, ended = outcome(reward, terminated, states, actions, predicted)
-        if curiosity:
+        following, rewards, ended = outcome(simulator.reward, simulator.terminated, states, actions, predicted)
+        if bonus:
             flat = (x.reshape(-1, x.shape[-1]) for x in (states, actions))
-            rewards = rewards + curiosity * disagreement(ensemble, *flat).reshape(rewards.shape)
+            rewards = rewards + bonus * disagreement(ensemble, *flat).reshape(rewards.shape)
         sound = _sound(following, rewards)
         # A product with `alive` would let what follows the end through: 0 * inf is NaN.
         total = total + jnp.where(alive > 0, jnp.where(sound, weight * rewards, jnp.nan), 0.0)

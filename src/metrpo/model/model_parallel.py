@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from metrpo.devices import part_of
+from metrpo.devices import AXIS, part_of
 from metrpo.model.ensemble import Ensemble, Networks, layer_outputs, network_outputs
 from metrpo.types import Array, Normaliser
 
@@ -23,7 +23,7 @@ _UNITS, _INPUTS = 2, 1
 class SharedEnsemble(NamedTuple):
     """One device's share of an ensemble. It stands for the `Ensemble` in `predict` and `predict_delta`.
 
-    Every device along `axis` asks for predictions of states of its own, as many as the others, and gets these.
+    Every device asks for predictions of states of its own, as many as the others, and gets these.
     """
 
     own: Networks
@@ -31,33 +31,36 @@ class SharedEnsemble(NamedTuple):
     cut: Networks
     """The members that remain; of every second hidden layer, this device's units."""
     normaliser: Normaliser
-    axis: str
 
     @property
     def members(self) -> int:
         """K."""
         own, remaining = (len(networks[0][0]) for networks in (self.own, self.cut))
-        return own * jax.lax.axis_size(self.axis) + remaining
+        return own * jax.lax.axis_size(AXIS) + remaining
 
     def outputs(self, x: Array) -> Array:
         """What the networks say, each member to its own batch: [K, B, I] -> [K, B, D], of this device's states."""
         own, remaining = (len(networks[0][0]) for networks in (self.own, self.cut))
-        x = jax.lax.all_gather(x, self.axis, axis=1, tiled=True)
+        x = jax.lax.all_gather(x, AXIS, axis=1, tiled=True)
         outputs = jnp.zeros((*x.shape[:2], self.own[-1][1].shape[-1]))
         if own:
-            first = own * jax.lax.axis_index(self.axis)
+            first = own * jax.lax.axis_index(AXIS)
             mine = network_outputs(self.own, jax.lax.dynamic_slice_in_dim(x, first, own))
             outputs = jax.lax.dynamic_update_slice_in_dim(outputs, mine, first, 0)
         if remaining:
             outputs = outputs.at[-remaining:].set(self._summands(x[-remaining:]))
-        return jax.lax.psum_scatter(outputs, self.axis, scatter_dimension=1, tiled=True)
+        return jax.lax.psum_scatter(outputs, AXIS, scatter_dimension=1, tiled=True)
+
+    def first(self) -> Ensemble:
+        """No device has one member by itself: samplings that ask for it are not shared (`Sampling.of_drawn_models`)."""
+        raise NotImplementedError("expected a sampling that draws a model for each state, got one of the first member")
 
     def _summands(self, x: Array) -> Array:
         """This device's part of the remaining members' outputs, which are the sums of the parts."""
         for layer, (weights, biases) in enumerate(self.cut):
             if layer > 0:
                 if _cut_along(layer - 1, self.cut) == _INPUTS:
-                    x = jax.lax.psum(x, self.axis)
+                    x = jax.lax.psum(x, AXIS)
                 x = jax.nn.relu(x)
             x = layer_outputs(x, weights, biases)
         return x
@@ -69,21 +72,21 @@ def can_share(networks: Networks, devices: int) -> bool:
     return len(hidden) > 0 and all(size % devices == 0 for size in hidden)
 
 
-def shared(ensemble: Ensemble, axis: str) -> SharedEnsemble:
-    """This device's share of `ensemble`, inside a `shard_map` over `axis`, where `can_share`."""
-    devices, this = jax.lax.axis_size(axis), jax.lax.axis_index(axis)
+def shared(ensemble: Ensemble) -> SharedEnsemble:
+    """This device's share of `ensemble`, inside `devices.spread`, where `can_share`."""
+    devices, this = jax.lax.axis_size(AXIS), jax.lax.axis_index(AXIS)
     own = ensemble.members // devices
     cut = []
     for layer, (weights, biases) in enumerate(ensemble.networks):
         weights, biases = weights[own * devices :], biases[own * devices :]
         along = _cut_along(layer, ensemble.networks)
         if along is not None:
-            weights = part_of(weights, axis, along)
+            weights = part_of(weights, along)
             # Where products are summed across devices, the biases come from one.
-            biases = part_of(biases, axis, _UNITS) if along == _UNITS else jnp.where(this == 0, biases, 0.0)
+            biases = part_of(biases, _UNITS) if along == _UNITS else jnp.where(this == 0, biases, 0.0)
         cut.append((weights, biases))
     mine = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, this * own, own), ensemble.networks)
-    return SharedEnsemble(mine, tuple(cut), ensemble.normaliser, axis)
+    return SharedEnsemble(mine, tuple(cut), ensemble.normaliser)
 
 
 def _cut_along(layer: int, networks: Networks) -> int | None:

@@ -1,18 +1,16 @@
 """How the next state comes out of the ensemble: one function for each way, in the table `SAMPLINGS`.
 
-A sampling is (ensemble, states [N, S], actions [N, A], keys) -> [N, D], the next state first and then what else
-is learned (paper, appendix "Ensemble sampling methods").
+Paper, appendix "Ensemble sampling methods".
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 
-from metrpo.model.ensemble import Ensemble, Predictor, first_member, predict
+from metrpo.model.ensemble import Predictor, predict
 from metrpo.types import Array
 
 
@@ -41,6 +39,13 @@ class Keys(NamedTuple):
     """The same in all steps of a batch of episodes."""
 
 
+class Draw(Protocol):
+    """The signature of every sampling."""
+
+    def __call__(self, ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
+        """[N, S], [N, A] -> [N, D]: the next states first, then what else is learned."""
+
+
 def step_rand(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
     """One model drawn at random for each state and step (paper, section 5)."""
     return _of_drawn_models(ensemble, states, actions, keys.step)
@@ -60,22 +65,22 @@ def _of_drawn_models(ensemble: Predictor, states: Array, actions: Array, key: Ar
     return jnp.zeros((states.shape[0], grouped.shape[-1])).at[slots].set(grouped, mode="drop")
 
 
-def one_model(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
+def one_model(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
     """The first model, always."""
-    return predict(first_member(ensemble), states[None], actions[None])[0]
+    return predict(ensemble.first(), states[None], actions[None])[0]
 
 
-def model_mean(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
+def model_mean(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
     """The mean of all models' predictions."""
     return jnp.mean(_of_all_models(ensemble, states, actions), axis=0)
 
 
-def model_med(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
+def model_med(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
     """The median of all models' predictions, dimension by dimension."""
     return jnp.median(_of_all_models(ensemble, states, actions), axis=0)
 
 
-def model_mean_std(ensemble: Ensemble, states: Array, actions: Array, keys: Keys) -> Array:
+def model_mean_std(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
     """Drawn from N(mean, std^2) of all models' predictions, dimension by dimension."""
     predictions = _of_all_models(ensemble, states, actions)
     noise = jax.random.normal(keys.step, predictions.shape[1:])
@@ -85,7 +90,7 @@ def model_mean_std(ensemble: Ensemble, states: Array, actions: Array, keys: Keys
     return jnp.mean(predictions, axis=0) + std * noise
 
 
-def _of_all_models(ensemble: Ensemble, states: Array, actions: Array) -> Array:
+def _of_all_models(ensemble: Predictor, states: Array, actions: Array) -> Array:
     return predict(ensemble, *(for_all(ensemble, x) for x in (states, actions)))
 
 
@@ -94,11 +99,19 @@ def for_all(ensemble: Predictor, x: Array) -> Array:
     return jnp.broadcast_to(x, (ensemble.members, *x.shape))
 
 
-SAMPLINGS: dict[str, Callable[[Any, Array, Array, Keys], Array]] = {
-    "step_rand": step_rand,
-    "model_mean_std": model_mean_std,
-    "model_mean": model_mean,
-    "model_med": model_med,
-    "eps_rand": eps_rand,
-    "one_model": one_model,
+class Sampling(NamedTuple):
+    """A row of the table."""
+
+    draw: Draw
+    of_drawn_models: bool = False
+    """Whether one model predicts for each state: devices may then share the models (`imagine.CORE_CACHE`)."""
+
+
+SAMPLINGS: dict[str, Sampling] = {
+    "step_rand": Sampling(step_rand, of_drawn_models=True),
+    "model_mean_std": Sampling(model_mean_std),
+    "model_mean": Sampling(model_mean),
+    "model_med": Sampling(model_med),
+    "eps_rand": Sampling(eps_rand, of_drawn_models=True),
+    "one_model": Sampling(one_model),
 }

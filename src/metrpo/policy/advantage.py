@@ -34,9 +34,9 @@ def gae(
     return discounted_returns(errors, mask, discount * gae_lambda)
 
 
-def standardise(advantages: Array, mask: Array, axis: str | None = None) -> Array:
+def standardise(advantages: Array, mask: Array) -> Array:
     """Advantages with mean 0 and standard deviation 1 where `mask` is 1, and 0 elsewhere."""
-    count = jnp.maximum(across(jnp.sum(mask), axis), 1.0)
-    mean = across(jnp.sum(advantages * mask), axis) / count
-    variance = across(jnp.sum(jnp.square(advantages - mean) * mask), axis) / count
+    count = jnp.maximum(across(jnp.sum(mask)), 1.0)
+    mean = across(jnp.sum(advantages * mask)) / count
+    variance = across(jnp.sum(jnp.square(advantages - mean) * mask)) / count
     return mask * (advantages - mean) / (jnp.sqrt(variance) + 1e-8)

@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import PartitionSpec
 
 from metrpo import devices, policy_phase
-from metrpo.config import CollectConfig, Config, FitConfig, TRPOConfig
+from metrpo.config import AdvantageConfig, CollectConfig, Config, FitConfig, TRPOConfig
+from metrpo.devices import FIRST, SECOND, WHOLE
 from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Ensemble
 from metrpo.model.fit import fit
-from metrpo.model.imagine import imagine
+from metrpo.model.imagine import Simulator, imagine
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers import trpo
@@ -176,19 +176,14 @@ def _imagine(width: str, products: str) -> Work:
     """50,000 imagined steps: 500 rollouts of 100."""
     ensemble, policy, task = _ensemble(width), _policy(), _task()
     ensemble = ensemble._replace(networks=ensembles.with_products(ensemble.networks, products))
-    mesh, whole = devices.mesh(ROLLOUTS, policy_phase.AXIS), PartitionSpec()
+    simulator, mesh = Simulator(ensemble, task.reward, task.terminated, HORIZON), devices.mesh(ROLLOUTS)
 
-    def rollouts(ensemble: Ensemble, policy: Policy, starts: Array, key: Array) -> Any:
-        act = partial(gaussian.sample, policy)
-        return imagine(
-            ensemble, act, task.reward, task.terminated, starts, HORIZON, key, "step_rand", policy_phase.AXIS
-        )
+    def rollouts(simulator: Simulator, policy: Policy, starts: Array, key: Array) -> Any:
+        return imagine(simulator, partial(gaussian.sample, policy), starts, key)
 
-    first, second = PartitionSpec(policy_phase.AXIS), PartitionSpec(None, policy_phase.AXIS)
-    imagined = Trajectories(second, second, second, second, last=first, going_on=first)
-    specs: Any = {"in_specs": (whole, whole, first, whole), "out_specs": (imagined, whole)}
-    run = jax.jit(jax.shard_map(rollouts, mesh=mesh, check_vma=False, **specs))
-    given = (*devices.copied((ensemble, policy), mesh), _starts(ROLLOUTS), jax.random.key(0))
+    imagined = Trajectories(SECOND, SECOND, SECOND, SECOND, last=FIRST, going_on=FIRST)
+    run = jax.jit(devices.spread(rollouts, mesh, (WHOLE, WHOLE, FIRST, WHOLE), (imagined, WHOLE)))
+    given = (*devices.copied((simulator, policy), mesh), _starts(ROLLOUTS), jax.random.key(0))
     steps = ROLLOUTS * HORIZON
     return Work(_timed(lambda: run(*given)), steps * _operations(width), _rate(products), steps)
 
@@ -202,14 +197,12 @@ def _trpo(config: TRPOConfig) -> Work:
     actions = np.asarray(gaussian.mean(policy, jnp.asarray(states))) + noise
     ones = np.ones(count, np.float32)
     batch = Batch(states, actions, rng.standard_normal(count, dtype=np.float32), ones)
-    mesh, whole, share = devices.mesh(count, policy_phase.AXIS), PartitionSpec(), PartitionSpec(policy_phase.AXIS)
+    mesh = devices.mesh(count)
 
     def update(policy: Policy, batch: Batch) -> Any:
-        return trpo.improve(policy, batch, config, policy_phase.AXIS)
+        return trpo.improve(policy, batch, config)
 
-    run = jax.jit(
-        jax.shard_map(update, mesh=mesh, in_specs=(whole, share), out_specs=whole, check_vma=False)  # type: ignore[arg-type]
-    )
+    run = jax.jit(devices.spread(update, mesh, (WHOLE, FIRST), WHOLE))
     policy, batch = devices.copied(policy, mesh), devices.shared(batch, mesh)
     return Work(_timed(lambda: run(policy, batch)), units=count)
 
@@ -219,18 +212,13 @@ def _baseline() -> Work:
     rng, shape = np.random.default_rng(0), (HORIZON, ROLLOUTS)
     states = rng.standard_normal((*shape, STATE), dtype=np.float32)
     rewards, ones = rng.standard_normal(shape, dtype=np.float32), np.ones(shape, np.float32)
-    mesh, whole, share = (
-        devices.mesh(ROLLOUTS, policy_phase.AXIS),
-        PartitionSpec(),
-        PartitionSpec(None, policy_phase.AXIS),
-    )
+    mesh = devices.mesh(ROLLOUTS)
 
     def solve(states: Array, rewards: Array, ones: Array, baseline: Array) -> Any:
         t = Trajectories(states, states[..., :ACTION], rewards, ones)
-        return linear.advantages_and_value(t, baseline, 1.0, 1.0, 1e-5, policy_phase.AXIS)
+        return linear.advantages_and_value(t, baseline, AdvantageConfig())
 
-    specs: Any = {"in_specs": (share, share, share, whole), "out_specs": (share, whole)}
-    run = jax.jit(jax.shard_map(solve, mesh=mesh, check_vma=False, **specs))
+    run = jax.jit(devices.spread(solve, mesh, (SECOND, SECOND, SECOND, WHOLE), (SECOND, WHOLE)))
     given = (states, rewards, ones, np.asarray(linear.init(STATE)))
     return Work(_timed(lambda: run(*given)), units=ROLLOUTS * HORIZON)
 
@@ -238,9 +226,10 @@ def _baseline() -> Work:
 def _validate(width: str) -> Work:
     """Every model's return of the policy, from as many starts as the preset of that width takes."""
     starts = preset(TASK, "paper" if width == "1024" else "fast").validate.starts
-    ensemble, policy = _ensemble(width), _policy()
+    task, policy = _task(), _policy()
+    simulator = Simulator(_ensemble(width), task.reward, task.terminated, task.horizon)
     steps = MEMBERS * starts * HORIZON
-    run = _timed(lambda: policy_phase.values_of(_task(), ensemble, policy, _starts(starts)))
+    run = _timed(lambda: policy_phase.values_of(simulator, policy, _starts(starts)))
     return Work(run, steps * _operations(width), "products", steps)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import jax
 import numpy as np
@@ -12,11 +13,13 @@ from hypothesis import strategies as st
 
 import probe
 from helpers import linear_ensemble, on_host, random_policy
-from metrpo import policy_phase, training
+from metrpo import devices, policy_phase, training
 from metrpo.config import AdvantageConfig, Config
 from metrpo.policy import advantage
-from metrpo.policy.improvers.table import batch_of, init_baseline, init_memory
+from metrpo.policy.improvers.settings import PhaseSettings
+from metrpo.policy.improvers.table import batch_of, init_memory
 from metrpo.policy.value import linear, network
+from metrpo.policy.value.table import VALUE_FUNCTIONS, init_baseline
 from metrpo.presets import override
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.types import Trajectories
@@ -278,10 +281,10 @@ DEVICES = 4
 
 
 def share(now, x, targets, mask, key):
-    return network.fit(now, x, targets, mask, QUICK, key, "devices")
+    return network.fit(now, x, targets, mask, QUICK, key)
 
 
-together = on_host()(jax.vmap(share, (None, 0, 0, 0, None), axis_name="devices"))
+together = on_host()(jax.vmap(share, (None, 0, 0, 0, None), axis_name=devices.AXIS))
 
 
 def shared(x, targets, mask, times):
@@ -323,25 +326,28 @@ def test_a_devices_say_is_its_share_of_the_steps_that_count():
 def test_the_setting_chooses_the_baseline(monkeypatch):
     calls = []
 
-    def record(rollouts, baseline, *given):
-        calls.append((baseline, *given))
+    def record(name, rollouts, baseline, *given):
+        calls.append((name, baseline, *given))
         return rollouts.rewards, "refitted"
 
-    monkeypatch.setattr(network, "advantages_and_value", record)
-    monkeypatch.setattr(linear, "advantages_and_value", record)
+    for name, row in VALUE_FUNCTIONS.items():
+        monkeypatch.setitem(VALUE_FUNCTIONS, name, row._replace(learn=partial(record, name)))
     settings = {"advantage.discount": 0.9, "advantage.gae_lambda": 0.8, "advantage.ridge": 0.1}
     plain = override(Config("Probe"), settings)
     deep = override(plain, {"advantage.baseline": "network", "imagine.horizon": T})
     for config in (plain, deep):
-        batch, refitted = batch_of(config, a_batch(5), "before", KEY, "devices")
+        batch, refitted = batch_of(config.advantage, a_batch(5), "before", KEY, config is deep)
         np.testing.assert_array_equal(batch.advantages.reshape(E, T).T, a_batch(5).rewards)
         assert refitted == "refitted"
-    assert calls == [("before", 0.9, 0.8, 0.1, "devices", False), ("before", deep.advantage, KEY, "devices", True)]
-    np.testing.assert_array_equal(init_baseline(plain, S, KEY), linear.init(S))
-    assert_same(init_baseline(deep, S, KEY), network.init(KEY, S, deep.advantage))
+    assert calls == [
+        ("linear", "before", plain.advantage, KEY, False),
+        ("network", "before", deep.advantage, KEY, True),
+    ]
+    np.testing.assert_array_equal(init_baseline(plain.advantage, S, KEY), linear.init(S))
+    assert_same(init_baseline(deep.advantage, S, KEY), network.init(KEY, S, deep.advantage))
     # What a policy phase leaves is what the next one starts with.
     now = fresh()
-    assert init_memory(network, None, now).baseline is now
+    assert init_memory(PhaseSettings.of(deep, cut=True), None, now).baseline is now
 
 
 def test_a_checkpoint_brings_the_network_back(tmp_path):
@@ -366,12 +372,14 @@ def test_the_probe_is_learned_from_a_quarter_of_its_episodes():
     ensemble = linear_ensemble([(probe.A, probe.B)])
     policy = random_policy(0, 2, 2, (), scale=0.3, std=0.5)
     pool, tests = np.split(np.random.default_rng(0).uniform(-0.7, 0.7, (60 * 120 + 50, 2)).astype(np.float32), [-50])
-    memory = init_memory(config, policy, fresh())
-    new, after, (info, _) = policy_phase._updates(
-        probe.PROBE, config, ensemble, policy, memory, pool.reshape(60, 120, 2), jax.random.key(1)
+    settings, simulator = PhaseSettings.of(config, cut=True), policy_phase.simulator_of(config, probe.PROBE, ensemble)
+    memory = init_memory(settings, policy, fresh())
+    new, after, (info, _) = policy_phase.run_updates(
+        settings, simulator, policy, memory, pool.reshape(60, 120, 2), jax.random.key(1)
     )
+    whole = policy_phase.simulator_of(Config("Probe"), probe.PROBE, ensemble)
     optimum = -np.mean(np.sum(tests @ probe.riccati()[0] * tests, axis=1))
-    before, reached = (policy_phase.values_of(probe.PROBE, ensemble, p, tests)[0] for p in (policy, new))
+    before, reached = (policy_phase.values_of(whole, p, tests)[0] for p in (policy, new))
     assert before < 15 * optimum
     assert 1.3 * optimum < reached < 0.999 * optimum
     assert np.all(info.accepted)

@@ -45,9 +45,9 @@ def by_gradient(kl: Array, improvement: Array, accepted: Array) -> ImproveInfo:
     return ImproveInfo(kl, improvement, accepted, jnp.int32(0), jnp.float32(0))
 
 
-def mean_kl(old: Policy, new: Policy, states: Array, mask: Array, axis: str | None) -> Array:
+def mean_kl(old: Policy, new: Policy, states: Array, mask: Array) -> Array:
     """KL(old || new), mean over the `states` [..., S] where `mask` [...] is 1."""
     means = gaussian.mean(old, states), gaussian.mean(new, states)
     kl = gaussian.kl(means[0], old.log_std, means[1], new.log_std)
-    total, count = across((jnp.sum(mask * kl), jnp.sum(mask)), axis)
+    total, count = across((jnp.sum(mask * kl), jnp.sum(mask)))
     return total / jnp.maximum(count, 1.0)

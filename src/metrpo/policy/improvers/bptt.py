@@ -35,12 +35,10 @@ def improve(
     starts: Array,
     config: GradientConfig,
     key: Array,
-    axis: str | None = None,
 ) -> tuple[Policy, Any, tuple[ImproveInfo, Any]]:
     """One gradient step on the mean return of rollouts from `starts` [N, S] under `act` (one of the two above).
 
-    Rollouts that diverge count nothing; one that meets NaN makes the gradient NaN, and the update is refused. With
-    `axis`, `starts` are this device's share (see `metrpo.devices`).
+    Rollouts that diverge count nothing; one that meets NaN makes the gradient NaN, and the update is refused.
     """
 
     def total_return(policy: Policy) -> tuple[Array, Any]:
@@ -48,8 +46,8 @@ def improve(
         return jnp.sum(rollouts.rewards * rollouts.mask), (rollouts, info)
 
     gradient, (rollouts, info) = jax.grad(total_return, has_aux=True)(policy)
-    count = across(jnp.float32(starts.shape[0]), axis)
-    gradient = jax.tree.map(lambda g: g / count, across(gradient, axis))
+    count = across(jnp.float32(starts.shape[0]))
+    gradient = jax.tree.map(lambda g: g / count, across(gradient))
     new, moments, accepted = ascend(policy, moments, gradient, config)
-    kl = mean_kl(policy, new, rollouts.states, rollouts.mask, axis)
+    kl = mean_kl(policy, new, rollouts.states, rollouts.mask)
     return new, moments, (by_gradient(kl, jnp.float32(0), accepted), info)

@@ -39,13 +39,11 @@ def improve(
     ppo: PPOConfig,
     config: GradientConfig,
     key: Array,
-    axis: str | None = None,
     penalty: float = 0.0,
 ) -> tuple[Policy, Any, ImproveInfo]:
     """`ppo.epochs` passes over `batch`, shuffled anew in each by `key`; `moments` are Adam's.
 
-    Steps that `ppo.minibatches` does not divide are left out of a pass, others each time. With `axis`, `batch` is this
-    device's share of the batch (see `metrpo.devices`).
+    Steps that `ppo.minibatches` does not divide are left out of a pass, others each time.
     """
     old_log_probability = gaussian.log_probability(gaussian.mean(policy, batch.states), policy.log_std, batch.actions)
     steps = batch.mask.shape[0]
@@ -55,8 +53,8 @@ def improve(
     def step(carry: tuple[Policy, Any, Array], index: Array) -> tuple[tuple[Policy, Any, Array], None]:
         policy, moments, sound = carry
         rows = jax.tree.map(partial(jnp.take, indices=index, axis=0), (batch, old_log_probability))
-        count = jnp.maximum(across(jnp.sum(rows[0].mask), axis), 1.0)
-        gradient = across(jax.grad(clipped_surrogate)(policy, *rows, ppo.clip, penalty), axis)
+        count = jnp.maximum(across(jnp.sum(rows[0].mask)), 1.0)
+        gradient = across(jax.grad(clipped_surrogate)(policy, *rows, ppo.clip, penalty))
         gradient = jax.tree.map(lambda g: g / count, gradient)
         policy, moments, made = ascend(policy, moments, gradient, config)
         return (policy, moments, sound & made), None
@@ -65,11 +63,11 @@ def improve(
         order = jax.random.permutation(key, steps)[: minibatches * size].reshape(minibatches, size)
         return jax.lax.scan(step, carry, order)[0], None
 
-    keys = jax.random.split(share_of(key, axis), ppo.epochs)
+    keys = jax.random.split(share_of(key), ppo.epochs)
     (new, moments, sound), _ = jax.lax.scan(epoch, (policy, moments, jnp.bool_(True)), keys)
-    count = jnp.maximum(across(jnp.sum(batch.mask), axis), 1.0)
+    count = jnp.maximum(across(jnp.sum(batch.mask)), 1.0)
     gain, start = (
-        across(clipped_surrogate(p, batch, old_log_probability, ppo.clip, penalty), axis) / count for p in (new, policy)
+        across(clipped_surrogate(p, batch, old_log_probability, ppo.clip, penalty)) / count for p in (new, policy)
     )
-    kl = mean_kl(policy, new, batch.states, batch.mask, axis)
+    kl = mean_kl(policy, new, batch.states, batch.mask)
     return new, moments, by_gradient(kl, gain - start, sound)

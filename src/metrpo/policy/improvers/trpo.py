@@ -18,17 +18,14 @@ from metrpo.policy.improvers.linearised import Linearised, chunked, forward, gau
 from metrpo.types import Array
 
 
-def improve(
-    policy: Policy, batch: Batch, config: TRPOConfig, axis: str | None = None, penalty: float = 0.0
-) -> tuple[Policy, ImproveInfo]:
+def improve(policy: Policy, batch: Batch, config: TRPOConfig, penalty: float = 0.0) -> tuple[Policy, ImproveInfo]:
     """One TRPO update on `batch`; the policy stays as it is when no step of the line search improves within max_kl.
 
     The surrogate loses `penalty` times the squared excess of mean actions beyond 0.9: clipped actions have no
-    gradient that could bring them back. With `axis`, `batch` is this device's share of the batch (see
-    `metrpo.devices`).
+    gradient that could bring them back.
     """
     states, actions, advantages, mask = (chunked(x) for x in batch)
-    count = jnp.maximum(across(jnp.sum(mask), axis), 1.0)
+    count = jnp.maximum(across(jnp.sum(mask)), 1.0)
     weights = mask * advantages / count
     old_log_std = policy.log_std[:, None]
     at = linearise(policy.layers, states)
@@ -50,7 +47,7 @@ def improve(
             return (total[0] + gain, total[1] + jnp.sum(mask * divergence)), None
 
         zero = (jnp.float32(0), jnp.float32(0))
-        surrogate, divergence = across(jax.lax.scan(add, zero, (states, actions, at.means, weights, mask))[0], axis)
+        surrogate, divergence = across(jax.lax.scan(add, zero, (states, actions, at.means, weights, mask))[0])
         return surrogate, divergence / count
 
     # The surrogate's gradient at the old policy, where every ratio is 1.
@@ -60,19 +57,19 @@ def improve(
         rising = rising - 2 * penalty / count * mask * gaussian.excess(at.means)
     slope = Policy(pull_back(at, rising), jnp.sum(weights * (jnp.square(z) - 1.0), axis=(0, 2)))
     flat, unravel = ravel_pytree(policy)
-    gradient = ravel_pytree(across(slope, axis))[0]
+    gradient = ravel_pytree(across(slope))[0]
     if (every := config.fisher_every) > 1:
         at_sample, sampled = linearise(policy.layers, chunked(batch.states[::every])), chunked(batch.mask[::every])
     else:
         at_sample, sampled = at, mask
-    product = fisher_product(policy, at_sample, sampled, config.damping, axis)
+    product = fisher_product(policy, at_sample, sampled, config.damping)
     direction, residual = conjugate_gradient(
         lambda v: ravel_pytree(product(unravel(v)))[0], gradient, config.cg_iterations
     )
     # F x = g - residual, so x'Fx needs no further product.
     curvature = jnp.dot(direction, gradient - residual)
     step = direction * jnp.sqrt(2 * config.max_kl / jnp.maximum(curvature, 1e-12))
-    start = across(jnp.sum(weights) - cost(at.means, mask), axis)
+    start = across(jnp.sum(weights) - cost(at.means, mask))
 
     def attempt(i: Array) -> tuple[Array, Array, Array]:
         candidate = flat + config.backtrack_ratio**i * step
@@ -99,19 +96,17 @@ def improve(
     )
 
 
-def fisher_product(
-    policy: Policy, at: Linearised, mask: Array, damping: float, axis: str | None = None
-) -> Callable[[Policy], Policy]:
+def fisher_product(policy: Policy, at: Linearised, mask: Array, damping: float) -> Callable[[Policy], Policy]:
     """v -> (F + damping I) v, F the policy's Fisher matrix averaged over the steps where `mask` [C, 1, CHUNK] is 1.
 
     The Gaussian's Fisher matrix is J' diag(1 / std^2) J for the mean network and 2 I for log_std (Gauss-Newton), which
     is the Hessian of KL(old || new) at new = old.
     """
-    count = jnp.maximum(across(jnp.sum(mask), axis), 1.0)
+    count = jnp.maximum(across(jnp.sum(mask)), 1.0)
     weights = mask * jnp.exp(-2 * policy.log_std)[:, None] / count
 
     def product(v: Policy) -> Policy:
-        curvature = Policy(across(gauss_newton(at, weights, v.layers), axis), 2.0 * v.log_std)
+        curvature = Policy(across(gauss_newton(at, weights, v.layers)), 2.0 * v.log_std)
         return jax.tree.map(lambda c, x: c + damping * x, curvature, v)
 
     return product

@@ -32,15 +32,11 @@ def improve(
     moments: Any,
     batch: Batch,
     config: GradientConfig,
-    axis: str | None = None,
     penalty: float = 0.0,
 ) -> tuple[Policy, Any, ImproveInfo]:
-    """One gradient step on `batch`; `moments` are Adam's.
-
-    With `axis`, `batch` is this device's share of the batch (see `metrpo.devices`).
-    """
-    count = jnp.maximum(across(jnp.sum(batch.mask), axis), 1.0)
-    gradient = across(jax.grad(objective)(policy, batch, count, penalty), axis)
+    """One gradient step on `batch`; `moments` are Adam's."""
+    count = jnp.maximum(across(jnp.sum(batch.mask)), 1.0)
+    gradient = across(jax.grad(objective)(policy, batch, count, penalty))
     new, moments, accepted = ascend(policy, moments, gradient, config)
-    kl = mean_kl(policy, new, batch.states, batch.mask, axis)
+    kl = mean_kl(policy, new, batch.states, batch.mask)
     return new, moments, by_gradient(kl, jnp.float32(0), accepted)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 import jax.numpy as jnp
 
+from metrpo.config import AdvantageConfig
 from metrpo.devices import across
 from metrpo.policy.advantage import discounted_returns, gae, standardise
 from metrpo.types import Array, Trajectories
@@ -27,44 +28,43 @@ def init(state_size: int) -> Array:
     return jnp.zeros(2 * state_size + 4)
 
 
-def fit(feature: Array, targets: Array, mask: Array, ridge: float, axis: str | None = None) -> Array:
+def fit(feature: Array, targets: Array, mask: Array, ridge: float) -> Array:
     """Ridge regression of `targets` [T, N] on `feature` [T, N, F] where `mask` [T, N] is 1: weights [F].
 
     Solved by the normal equations in the columns' own scale, which float32 needs: squares reach 100 and counts 50,000.
     """
     x = (feature * mask[..., None]).reshape(-1, feature.shape[-1])
-    gram = across(x.T @ x, axis) + ridge * jnp.eye(x.shape[1])
+    gram = across(x.T @ x) + ridge * jnp.eye(x.shape[1])
     scale = jax.lax.rsqrt(jnp.diag(gram))
     # Constant or repeated columns are exactly collinear; the jitter is float32's resolution, below any real signal.
     scaled = gram * scale * scale[:, None] + 1e-6 * jnp.eye(x.shape[1])
-    target = across(x.T @ (targets * mask).reshape(-1), axis)
+    target = across(x.T @ (targets * mask).reshape(-1))
     weights = scale * jax.scipy.linalg.solve(scaled, scale * target, assume_a="pos")
     return jnp.where(jnp.all(jnp.isfinite(weights)), weights, 0.0)
 
 
 def advantages_and_value(
-    trajectories: Trajectories,
-    baseline: Array,
-    discount: float,
-    gae_lambda: float,
-    ridge: float,
-    axis: str | None = None,
-    cut: bool = False,
+    trajectories: Trajectories, baseline: Array, config: AdvantageConfig, key: Array | None = None, cut: bool = False
 ) -> tuple[Array, Array]:
     """Standardised advantages [T, N] under `baseline`, and the baseline refitted to this batch for the next one.
 
-    Trajectories that were `cut` off before their end go on with the baseline's value, which then knows no time. With
-    `axis`, the trajectories are this device's share of the batch (see `metrpo.devices`).
+    Trajectories that were `cut` off before their end go on with the baseline's value, which then knows no time. Nothing
+    here is drawn: `key` is for the other value functions.
     """
-    rewards, mask = trajectories.rewards, trajectories.mask
+    rewards, mask, discount = trajectories.rewards, trajectories.mask, config.discount
     feature = features(trajectories.states, timeless=cut)
     values = feature @ baseline
     if cut:
-        after = trajectories.going_on * (features(trajectories.last[None], timeless=True)[0] @ baseline)
-        advantages = gae(rewards, values, mask, discount, gae_lambda, after)
+        after = trajectories.going_on * at_cut(baseline, trajectories.last)
+        advantages = gae(rewards, values, mask, discount, config.gae_lambda, after)
         rewards = rewards.at[-1].add(discount * after)
     else:
-        advantages = gae(rewards, values, mask, discount, gae_lambda)
+        advantages = gae(rewards, values, mask, discount, config.gae_lambda)
     returns = discounted_returns(rewards, mask, discount)
-    refitted = fit(feature, returns, trajectories.mask, ridge, axis)
-    return standardise(advantages, trajectories.mask, axis), refitted
+    refitted = fit(feature, returns, trajectories.mask, config.ridge)
+    return standardise(advantages, trajectories.mask), refitted
+
+
+def at_cut(baseline: Array, states: Array) -> Array:
+    """[N]: the values of the states [N, S] in which episodes are cut off, whatever the time."""
+    return features(states[None], timeless=True)[0] @ baseline

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 
 from metrpo.config import AdvantageConfig
-from metrpo.devices import across, share_of
+from metrpo.devices import across, share_of, sharers
 from metrpo.policy import gaussian
 from metrpo.policy.advantage import gae, standardise
 from metrpo.types import Array, Trajectories
@@ -60,34 +60,36 @@ def predict(value: Value, x: Array) -> Array:
     return value.target_mean + value.target_std * _network(value.layers, _normalised(value, x))
 
 
+def at_cut(value: Value, states: Array) -> Array:
+    """[N]: the values of the states [N, S] in which episodes are cut off, whatever the time."""
+    return predict(value, inputs(states[None], timeless=True)[0])
+
+
 def advantages_and_value(
     trajectories: Trajectories,
-    value: Value,
+    baseline: Value,
     config: AdvantageConfig,
     key: Array,
-    axis: str | None = None,
     cut: bool = False,
 ) -> tuple[Array, Value]:
-    """Standardised advantages [T, N] under `value`, and the network fitted to this batch for the next one.
+    """Standardised advantages [T, N] under `baseline`, and the network fitted to this batch for the next one.
 
     As `linear.advantages_and_value` does it with the linear baseline; `key` draws the minibatches.
     """
     rewards, mask, discount = trajectories.rewards, trajectories.mask, config.discount
     x = inputs(trajectories.states, timeless=cut)
-    values = predict(value, x)
+    values = predict(baseline, x)
     after = jnp.zeros_like(values[0])
     if cut:
-        after = trajectories.going_on * predict(value, inputs(trajectories.last[None], timeless=True)[0])
+        after = trajectories.going_on * at_cut(baseline, trajectories.last)
     advantages = gae(rewards, values, mask, discount, config.gae_lambda, after)
     # The lambda-return: at lambda 1 what the episode earned, below it less noisy and leaning on the old value.
     targets = values + advantages
     flat = (x.reshape(-1, x.shape[-1]), targets.reshape(-1), mask.reshape(-1))
-    return standardise(advantages, mask, axis), fit(value, *flat, config, key, axis)
+    return standardise(advantages, mask), fit(baseline, *flat, config, key)
 
 
-def fit(
-    value: Value, x: Array, targets: Array, mask: Array, config: AdvantageConfig, key: Array, axis: str | None = None
-) -> Value:
+def fit(value: Value, x: Array, targets: Array, mask: Array, config: AdvantageConfig, key: Array) -> Value:
     """The network after `config.value_steps` steps of Adam towards `targets` [n] of inputs [n, S + 1].
 
     Minibatches are drawn with replacement where `mask` [n] is 1, by every device from its share of the batch. A fit
@@ -95,13 +97,13 @@ def fit(
     """
     sums = jnp.cumsum(mask)
     count = sums[-1]
-    total = across(count, axis)
+    total = across(count)
     # A device whose share counts fewer steps has that much less to say.
     weight = count / jnp.maximum(total, 1.0)
-    fresh = _renormalised(value, x, targets, mask, axis)
+    fresh = _renormalised(value, x, targets, mask)
     z = (targets - fresh.target_mean) / fresh.target_std
     optimizer = _optimizer(config)
-    size = -(-config.value_batch_size // (1 if axis is None else jax.lax.axis_size(axis)))
+    size = -(-config.value_batch_size // sharers())
 
     def loss(layers: Any, x: Array, z: Array) -> Array:
         return weight * jnp.mean(jnp.square(_network(layers, _normalised(fresh, x)) - z))
@@ -111,23 +113,23 @@ def fit(
         # The r-th step that counts, r uniform: where the sums first pass r.
         index = jnp.searchsorted(sums, jax.random.uniform(key, (size,)) * count, side="right")
         rows = (jnp.take(array, index, axis=0, mode="clip") for array in (x, z))
-        gradient = across(jax.grad(loss)(layers, *rows), axis)
+        gradient = across(jax.grad(loss)(layers, *rows))
         change, moments = optimizer.update(gradient, moments)
         return (optax.apply_updates(layers, change), moments), None
 
-    keys = jax.random.split(share_of(key, axis), config.value_steps)
+    keys = jax.random.split(share_of(key), config.value_steps)
     (layers, moments), _ = jax.lax.scan(step, (fresh.layers, fresh.moments), keys)
     new = fresh._replace(layers=layers, moments=moments)
     sound = (total > 0) & jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(new)]))
     return jax.tree.map(lambda now, before: jnp.where(sound, now, before), new, value)
 
 
-def _renormalised(value: Value, x: Array, targets: Array, mask: Array, axis: str | None) -> Value:
+def _renormalised(value: Value, x: Array, targets: Array, mask: Array) -> Value:
     """`value` in the units of this batch: the same network, so that predictions move and stretch with the targets."""
-    count = jnp.maximum(across(jnp.sum(mask), axis), 1.0)
+    count = jnp.maximum(across(jnp.sum(mask)), 1.0)
 
     def mean(rows: Array) -> Array:
-        return across(mask @ rows, axis) / count
+        return across(mask @ rows) / count
 
     # Steps that do not count may hold anything, and 0 times infinity is NaN.
     seen, aims = jnp.where(mask[:, None] > 0, x, 0.0), jnp.where(mask > 0, targets, 0.0)
