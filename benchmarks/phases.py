@@ -17,7 +17,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from metrpo import algorithm, config, init, policy_phase
+from metrpo import State, config, init, policy_phase
 from metrpo.config import Config
 from metrpo.console.progress import SILENT
 from metrpo.model import ensemble as ensembles
@@ -28,6 +28,7 @@ from metrpo.presets import override
 from metrpo.run.clock import Clock
 from metrpo.run.directory import RunDirectory
 from metrpo.seeds import Stage, key_of
+from metrpo.stages import policy_search, records
 from metrpo.world.registry import task_for
 
 
@@ -53,7 +54,7 @@ def main() -> None:
         print(f"{variant}: last phases earn {np.mean(last):.1f} (worst {np.min(last):.1f})", flush=True)
 
 
-def phases(config: Config, state: algorithm.State, count: int, fresh: bool, variant: str, seed: int) -> float:
+def phases(config: Config, state: State, count: int, fresh: bool, variant: str, seed: int) -> float:
     """Plays `count` phases and returns what the last policy earns."""
     config = override(config, {"seed": seed})
     task, e, data = task_for(config), config.ensemble, state.dataset
@@ -64,11 +65,11 @@ def phases(config: Config, state: algorithm.State, count: int, fresh: bool, vari
     state = state._replace(policy=first, baseline=baseline)
     earned = np.nan
     for number in range(1, count + 1):
-        policy, baseline, info = algorithm._improve(
+        policy, baseline, info = policy_search.improve_policy(
             config, task, state._replace(iteration=number - 1), ensemble, SILENT, Clock()
         )
         state = state._replace(policy=policy, baseline=baseline)
-        earned = float(np.mean(algorithm.evaluate(config, task, policy, number, origin=state.origin)))
+        earned = float(np.mean(records.evaluate(config, task, policy, number, origin=state.origin)))
         horizon, key = policy_phase.imagined_horizon(config, task), jax.random.key(seed)
         saturated = diagnose(ensemble, policy, data.validation, data.train, horizon, key).saturated
         std = float(np.mean(np.exp(np.asarray(policy.log_std))))

@@ -27,7 +27,9 @@ from metrpo.policy.inputs import folded, inputs_of, normalised
 from metrpo.policy.value import linear
 from metrpo.presets import override, preset
 from metrpo.run import clock as clock_module
+from metrpo.run.clock import Clock
 from metrpo.speed.measure import compilations
+from metrpo.stages import ensemble_fit, policy_search, real_steps, records
 from metrpo.world import registry
 
 TINY = override(
@@ -156,10 +158,10 @@ def test_collection_stops_at_a_budget_below_one_iterations(tiny, ends):
 
 
 def test_episodes_of_the_record_have_a_bound(tiny, monkeypatch):
-    monkeypatch.setattr(algorithm, "RECORDED", 7)
+    monkeypatch.setattr(records, "RECORDED", 7)
     asked = []
     monkeypatch.setattr(probe.ProbeEnv, "step", counted(probe.ProbeEnv.step, asked))
-    returns = algorithm.evaluate(TINY, probe.LONG_PROBE, tiny.states[0].policy, 1)
+    returns = records.evaluate(TINY, probe.LONG_PROBE, tiny.states[0].policy, 1)
     assert len(returns) == 2
     assert len(asked) == 2 * 7
     _, row = training.step(TINY, tiny.states[0])
@@ -244,7 +246,7 @@ def test_the_return_is_the_accepted_policys_without_noise(tiny, monkeypatch):
         seen.update(act=act, episodes=episodes, seed=seed)
         return np.array([1.0, 4.0])
 
-    monkeypatch.setattr(algorithm.real, "evaluate", evaluate)
+    monkeypatch.setattr(real_steps.real, "evaluate", evaluate)
     state, row = training.step(TINY, tiny.states[1])
     assert (row["return_real"], row["return_real_std"]) == (2.5, 1.5)
     assert seen["episodes"] == 2
@@ -266,9 +268,13 @@ def test_the_previous_policy_precedes_the_last_changing_phase(tiny, monkeypatch,
 
     def phase(*args):
         values = np.zeros(2, np.float32)
-        return policy, np.zeros(8, np.float32), algorithm.PhaseInfo(values, 10, accepted, 0, 2, np.zeros(2), 0.0, 0.0)
+        return (
+            policy,
+            np.zeros(8, np.float32),
+            policy_phase.PhaseInfo(values, 10, accepted, 0, 2, np.zeros(2), 0.0, 0.0),
+        )
 
-    monkeypatch.setattr(algorithm, "_improve", phase)
+    monkeypatch.setattr(algorithm, "improve_policy", phase)
     old = tiny.states[2]._replace(previous_policy=random_policy(8, 2, 2, hidden=(4,)))
     new, _ = training.step(TINY, old)
     assert equal(new.policy, policy)
@@ -278,7 +284,7 @@ def test_the_previous_policy_precedes_the_last_changing_phase(tiny, monkeypatch,
 def test_parameter_noise_is_in_proportion_to_each_change():
     now, before = random_policy(0, 3, 2, hidden=(40,)), random_policy(1, 3, 2, hidden=(40,))
     rng = np.random.default_rng(0)
-    drawn = [algorithm._perturbed(now, before, 3.0, rng).args[0] for _ in range(2000)]
+    drawn = [real_steps.perturbed(now, before, 3.0, rng).args[0] for _ in range(2000)]
     weights = np.array([d.layers[0][0] for d in drawn])
     z = (weights - now.layers[0][0]) / np.abs(now.layers[0][0] - before.layers[0][0])
     assert z.mean() == pytest.approx(0, abs=0.03)
@@ -286,14 +292,14 @@ def test_parameter_noise_is_in_proportion_to_each_change():
     assert np.abs(np.corrcoef(z.reshape(2000, -1)[:, :10].T) - np.eye(10)).max() < 0.1
     assert drawn[0].layers[1][1] != pytest.approx(drawn[1].layers[1][1])
     state = np.array([0.1, 0.2, 0.3])
-    np.testing.assert_allclose(algorithm._perturbed(now, before, 0.0, rng)(state), slow_mean(now, state), atol=1e-5)
-    np.testing.assert_allclose(algorithm._perturbed(now, now, 3.0, rng)(state), slow_mean(now, state), atol=1e-5)
+    np.testing.assert_allclose(real_steps.perturbed(now, before, 0.0, rng)(state), slow_mean(now, state), atol=1e-5)
+    np.testing.assert_allclose(real_steps.perturbed(now, now, 3.0, rng)(state), slow_mean(now, state), atol=1e-5)
 
 
 def test_the_clock_counts_nothing_twice(monkeypatch):
     now = iter([0.0, 10.0, 13.0, 20.0, 24.0, 40.0])
     monkeypatch.setattr(clock_module.time, "perf_counter", lambda: next(now))
-    clock = algorithm.Clock()
+    clock = Clock()
     with clock("improve"):  # 0 to 40
         with clock("validate"):  # 10 to 13
             pass
@@ -318,9 +324,9 @@ def captured_fit(monkeypatch, config, iteration, dataset):
         given.extend(args)
         raise Stop
 
-    monkeypatch.setattr(algorithm, "fit", fit)
+    monkeypatch.setattr(ensemble_fit, "fit", fit)
     with pytest.raises(Stop):
-        algorithm._fit(config, probe.PROBE, "the last networks", dataset, iteration, SILENT)
+        ensemble_fit.fit_ensemble(config, probe.PROBE, "the last networks", dataset, iteration, SILENT)
     return given
 
 
@@ -373,9 +379,9 @@ class Script:
         self.accepted, self.baseline, self.info = self.run(config)
 
     def run(self, config):
-        state, clock = self.state, algorithm.Clock()
+        state, clock = self.state, Clock()
         ensemble = random_ensemble(0, 2, 2, 2)
-        return algorithm._improve(config, probe.PROBE, state, ensemble, SILENT, clock)
+        return policy_search.improve_policy(config, probe.PROBE, state, ensemble, SILENT, clock)
 
     def _updates(self, settings, simulator, policy, memory, starts, key):
         count = len(starts)
@@ -512,7 +518,7 @@ def test_the_oracle_plays_other_starts_than_the_record(tiny, monkeypatch):
         seeds.append(seed)
         return np.arange(episodes, dtype=float)
 
-    monkeypatch.setattr(algorithm.real, "evaluate", evaluate)
+    monkeypatch.setattr(real_steps.real, "evaluate", evaluate)
     training.step(override(TINY, {"validate.rule": "real"}), tiny.states[1])
     *oracle, record = seeds
     assert len(oracle) >= 2
@@ -529,7 +535,7 @@ def test_a_phase_on_normalised_states_keeps_the_first_policy(tiny, monkeypatch):
     monkeypatch.setattr(
         policy_phase, "values_of", lambda simulator, policy, *_: seen.append((policy, simulator.inputs)) or [0.0]
     )
-    policy, *_ = algorithm._improve(config, probe.PROBE, state, ensemble, SILENT, algorithm.Clock())
+    policy, *_ = policy_search.improve_policy(config, probe.PROBE, state, ensemble, SILENT, Clock())
     (inside, inputs), *_ = seen
     rows = state.dataset.train.states
     np.testing.assert_allclose(normalised(inputs, rows).std(0), 1, rtol=1e-3)
@@ -546,7 +552,7 @@ def test_parameter_noise_does_not_know_the_units_of_the_states(offset, scale):
 
     def actions(inputs, states):
         policies = (folded(p, inputs) for p in (now, before))
-        act = algorithm._perturbed(*policies, 3.0, np.random.default_rng(5), inputs)
+        act = real_steps.perturbed(*policies, 3.0, np.random.default_rng(5), inputs)
         return np.array([act(s) for s in states])
 
     np.testing.assert_allclose(actions(other, offset + scale * rows), actions(plain, rows), atol=0.05)

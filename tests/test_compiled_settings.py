@@ -20,7 +20,7 @@ from metrpo.policy.stopping import RULES
 from metrpo.policy.value.table import VALUE_FUNCTIONS
 from metrpo.presets import override
 
-ROOMS = ("algorithm", "policy_phase", "model", "policy", "baselines")
+ROOMS = ("algorithm", "stages", "policy_phase", "model", "policy", "baselines")
 CHOICES = [
     (Config, "improver", IMPROVERS),
     (AdvantageConfig, "baseline", VALUE_FUNCTIONS),

@@ -29,6 +29,7 @@ from metrpo.run.episodes import EpisodeLog
 from metrpo.run.export import export
 from metrpo.run.files import read_arrays, write_arrays
 from metrpo.run.policy_file import load_policy, save_policy
+from metrpo.stages import records
 from metrpo.types import Episode
 from metrpo.world import dataset as datasets
 from metrpo.world import registry
@@ -237,12 +238,12 @@ def learn_at_once(monkeypatch):
     def networks(config, task, key):
         return random_ensemble(0, 2, task.state_size, task.action_size).networks
 
-    monkeypatch.setattr(algorithm, "_fresh_networks", networks)
+    monkeypatch.setattr(algorithm, "fresh_networks", networks)
     monkeypatch.setattr(algorithm.gaussian, "init", lambda key, s, a, hidden, std: random_policy(0, s, a, hidden))
     monkeypatch.setattr(algorithm, "init_baseline", lambda *_: np.zeros(1, np.float32))
-    monkeypatch.setattr(algorithm, "_fit", fit)
-    monkeypatch.setattr(algorithm, "_improve", improve)
-    monkeypatch.setattr(algorithm, "_diagnosis", lambda _, task, *rest: unknown(task.state_size, probe.HORIZON))
+    monkeypatch.setattr(algorithm, "fit_ensemble", fit)
+    monkeypatch.setattr(algorithm, "improve_policy", improve)
+    monkeypatch.setattr(records, "_diagnosis", lambda _, task, *rest: unknown(task.state_size, probe.HORIZON))
 
 
 @pytest.mark.parametrize("learns", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -265,7 +266,7 @@ def test_a_run_with_an_offset_resumes_byte_for_byte(tmp_path, known, monkeypatch
     assert stored.origin == pytest.approx([1e8, 1e8])
     state = load_state(parts / newest, training.init(config))[0]
     # The record was earned by the policy in the file, counted from its origin.
-    earned = algorithm.evaluate(config, task, state.policy, 2, origin=state.origin).mean()
+    earned = records.evaluate(config, task, state.policy, 2, origin=state.origin).mean()
     assert earned == pytest.approx(stored.info.return_real, rel=1e-6)
 
 

@@ -15,7 +15,6 @@ import torch
 
 import probe
 from metrpo import training
-from metrpo.algorithm import evaluate
 from metrpo.baselines import openai_defaults as defaults
 from metrpo.baselines import stable_baselines
 from metrpo.config import Config
@@ -28,6 +27,7 @@ from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.curve import draw_curve
 from metrpo.run.policy_file import load_policy, save_policy
 from metrpo.seeds import Stage
+from metrpo.stages.records import evaluate
 
 TINY = override(
     Config(task="Probe", iterations=3, evaluation_episodes=2),

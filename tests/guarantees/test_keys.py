@@ -15,6 +15,7 @@ import probe
 from metrpo import algorithm, seeds, training
 from metrpo.config import Config
 from metrpo.presets import override
+from metrpo.stages import ensemble_fit, policy_search, real_steps, records
 
 TINY = override(
     Config(task="Probe", iterations=2, evaluation_episodes=2),
@@ -112,8 +113,11 @@ def test_nothing_random_is_used_twice(options, monkeypatch):
 
         return make
 
+    stages = (algorithm, ensemble_fit, policy_search, real_steps, records)
     for name in ("rng_of", "key_of"):
-        monkeypatch.setattr(algorithm, name, noted(getattr(seeds, name)))
+        for module in stages:
+            if hasattr(module, name):
+                monkeypatch.setattr(module, name, noted(getattr(seeds, name)))
     config = override(TINY, options)
     state = training.init(config)
     for _ in range(config.iterations):

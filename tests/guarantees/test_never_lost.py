@@ -30,6 +30,7 @@ from metrpo.policy_phase import PhaseInfo
 from metrpo.run import machine
 from metrpo.run.directory import RunDirectory
 from metrpo.run.metrics import read_metrics
+from metrpo.stages import records
 from metrpo.training import train
 from metrpo.world import collect as real
 from metrpo.world import dataset as datasets
@@ -100,9 +101,9 @@ def test_no_record_costs_what_is_learned(monkeypatch, caplog):
     episodes = algorithm.collect(config, task, state)
     monkeypatch.setattr(Sick, "sickness", staticmethod(lambda start, step: step == 3))
     monkeypatch.setattr(Sick, "close", fails)
-    monkeypatch.setattr(algorithm, "diagnose", fails)
-    monkeypatch.setattr(algorithm, "end_calibration", fails)
-    monkeypatch.setattr(algorithm.scales, "count", fails)
+    monkeypatch.setattr(records, "diagnose", fails)
+    monkeypatch.setattr(records, "end_calibration", fails)
+    monkeypatch.setattr(records.scales, "count", fails)
     caplog.clear()
     found, row = algorithm.learn(config, task, state, episodes)
     assert str(found) == str(expected)
@@ -146,8 +147,8 @@ def _learn_nothing(monkeypatch):
         beyond = np.zeros((length, count, actions.shape[-1]))
         return still, np.zeros(count), still[:, 0], np.zeros((length, count)), beyond
 
-    monkeypatch.setattr(algorithm, "_fit", fit)
-    monkeypatch.setattr(algorithm, "_improve", improve)
+    monkeypatch.setattr(algorithm, "fit_ensemble", fit)
+    monkeypatch.setattr(algorithm, "improve_policy", improve)
     monkeypatch.setattr(diagnostics, "_rollouts", rollouts)
     monkeypatch.setattr(calibration, "_ends", lambda ensemble, states, actions: np.zeros((2, len(states))))
 
@@ -157,7 +158,7 @@ def test_a_request_to_stop_is_not_taken_for_a_failure():
         raise Stopped(signal.SIGTERM)
 
     with pytest.raises(Stopped):
-        algorithm.recorded("return_real", 1, stops, None)
+        records.recorded("return_real", 1, stops, None)
 
 
 # ---------------------------------------------------------------- episodes
@@ -304,9 +305,9 @@ def test_only_episodes_longer_than_the_steps_asked_for_are_cut(long_task):
 
 def test_an_evaluation_ends(long_task, monkeypatch):
     config = dataclasses.replace(CONFIG, task="Long", evaluation_episodes=1000)
-    monkeypatch.setattr(algorithm, "EVALUATION_STEPS", 2 * LONG)
-    assert len(algorithm.evaluate(config, long_task, training.init(config).policy, 1)) == 2
-    assert algorithm.evaluate(CONFIG, probe.PROBE, training.init(CONFIG).policy, 1).shape == (1,)
+    monkeypatch.setattr(records, "EVALUATION_STEPS", 2 * LONG)
+    assert len(records.evaluate(config, long_task, training.init(config).policy, 1)) == 2
+    assert records.evaluate(CONFIG, probe.PROBE, training.init(CONFIG).policy, 1).shape == (1,)
 
 
 def test_a_request_to_stop_does_not_wait_for_a_long_episode(tmp_path, monkeypatch, capfd):

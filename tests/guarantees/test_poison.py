@@ -28,7 +28,9 @@ from metrpo.policy.value import linear
 from metrpo.policy.value.table import init_baseline
 from metrpo.presets import override
 from metrpo.run import directory
+from metrpo.run.clock import Clock
 from metrpo.run.metrics import completed, read_metrics
+from metrpo.stages import ensemble_fit, policy_search, records
 from metrpo.training import train
 from metrpo.types import Trajectories
 from metrpo.world import collect as real
@@ -67,7 +69,7 @@ def _probe_is_a_task():
 def clean(tmp_path_factory):
     """A whole run that nothing disturbs: its directory, its states, its rows, and what each fit gave."""
     path, states, rows, fits = tmp_path_factory.mktemp("clean") / "run", [], [], []
-    learn, fit = algorithm.learn, algorithm.fit
+    learn, fit = algorithm.learn, ensemble_fit.fit
 
     def watched(*args):
         state, row = learn(*args)
@@ -81,7 +83,7 @@ def clean(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(algorithm, "learn", watched)
-        patch.setattr(algorithm, "fit", watched_fit)
+        patch.setattr(ensemble_fit, "fit", watched_fit)
         train(TINY, path)
     return types.SimpleNamespace(path=path, states=states, rows=rows, fits=fits)
 
@@ -155,7 +157,7 @@ def test_a_sick_environment_is_named_with_stage_and_step(clean, monkeypatch, cap
     assert re.match(f"collect, {message}", caplog.messages[0])
     Sick(monkeypatch, what, at, value, episode=1)
     with pytest.raises(TaskError, match=f"^evaluate, {message}"), finite.naming("evaluate", 2):
-        algorithm.evaluate(TINY, probe.PROBE, clean.states[0].policy, 2)
+        records.evaluate(TINY, probe.PROBE, clean.states[0].policy, 2)
 
 
 @pytest.mark.parametrize("value", [*POISON, 1e39])
@@ -231,7 +233,7 @@ def going_on(clean, state):
 @pytest.mark.parametrize("part", ["states", "actions", "deltas"])
 @pytest.mark.parametrize("split", ["train", "validation"])
 def test_poisoned_data_are_named_and_never_learned_from(clean, monkeypatch, split, part, value):
-    monkeypatch.setattr(algorithm, "fit", None)
+    monkeypatch.setattr(ensemble_fit, "fit", None)
     dataset = clean.states[0].dataset
     rows = getattr(dataset, split)
     rows = rows._replace(**{part: poisoned(getattr(rows, part), value, at=5)})
@@ -264,13 +266,13 @@ def test_a_poisoned_linear_baseline_costs_one_update(clean, value):
 
 
 def test_what_no_stage_has_noticed_is_not_saved(clean, tmp_path, monkeypatch):
-    improve = algorithm._improve
+    improve = algorithm.improve_policy
 
     def spoilt(config, task, state, *rest):
         policy, baseline, info = improve(config, task, state, *rest)
         return (policy, poisoned(baseline, math.nan, at=3), info) if state.iteration == 1 else (policy, baseline, info)
 
-    monkeypatch.setattr(algorithm, "_improve", spoilt)
+    monkeypatch.setattr(algorithm, "improve_policy", spoilt)
     with pytest.raises(
         DivergedError, match=r"^improve, iteration 2: baseline: expected finite numbers, got nan at \[3\]"
     ):
@@ -311,14 +313,14 @@ def member_poisoned(networks, k, value, leaf=0):
 @pytest.mark.parametrize("leaf", LEAVES)
 def test_a_poisoned_member_is_made_anew_and_disturbs_no_other(clean, caplog, leaf, value):
     state = clean.states[0]._replace(networks=member_poisoned(clean.states[0].networks, 1, value, LEAVES[leaf]))
-    ensemble, info = algorithm._fit(TINY, probe.PROBE, state.networks, clean.states[1].dataset, 2, SILENT)
+    ensemble, info = ensemble_fit.fit_ensemble(TINY, probe.PROBE, state.networks, clean.states[1].dataset, 2, SILENT)
     assert (info.resets, sound(ensemble), sound(info)) == (1, True, True)
     assert "fit, iteration 2: members 1 diverged: re-initialised and fitted again" in caplog.text
     expected, expected_info = clean.fits[1]
     assert same(only(ensemble.networks, [0, 2]), only(expected.networks, [0, 2]))
     assert same(only(info[1:4], [0, 2]), only(expected_info[1:4], [0, 2]))
     assert info.validation_loss[1] < 3 * np.max(expected_info.validation_loss) + 0.1, "it has learned"
-    again, _ = algorithm._fit(TINY, probe.PROBE, state.networks, clean.states[1].dataset, 2, SILENT)
+    again, _ = ensemble_fit.fit_ensemble(TINY, probe.PROBE, state.networks, clean.states[1].dataset, 2, SILENT)
     assert same(again.networks, ensemble.networks)
 
 
@@ -345,7 +347,7 @@ class Blocks:
 
 
 def second_fit(clean):
-    return algorithm._fit(TINY, probe.PROBE, clean.states[0].networks, clean.states[1].dataset, 2, SILENT)
+    return ensemble_fit.fit_ensemble(TINY, probe.PROBE, clean.states[0].networks, clean.states[1].dataset, 2, SILENT)
 
 
 @pytest.mark.parametrize("value", POISON)
@@ -397,8 +399,8 @@ def test_a_learning_rate_far_too_large_is_said_so(tmp_path):
 
 def in_imagination(clean, ensemble, settings=None):
     state = clean.states[0]._replace(dataset=clean.states[1].dataset)
-    return algorithm._improve(
-        override(TINY, settings or {}), probe.PROBE, state._replace(iteration=1), ensemble, SILENT, algorithm.Clock()
+    return policy_search.improve_policy(
+        override(TINY, settings or {}), probe.PROBE, state._replace(iteration=1), ensemble, SILENT, Clock()
     )
 
 
@@ -428,13 +430,13 @@ def test_where_all_rollouts_explode_no_update_is_made(clean, value):
 
 
 def test_a_run_with_a_member_that_explodes_on_purpose_goes_on(tmp_path, monkeypatch):
-    fit = algorithm.fit
+    fit = ensemble_fit.fit
 
     def explosive(*args):
         ensemble, info = fit(*args)
         return ensemble._replace(networks=jax.tree.map(lambda x: x.at[1].multiply(1e6), ensemble.networks)), info
 
-    monkeypatch.setattr(algorithm, "fit", explosive)
+    monkeypatch.setattr(ensemble_fit, "fit", explosive)
     train(TINY, tmp_path)
     assert iterations_on_disk(tmp_path) == 3
     rows = read_metrics(tmp_path / "metrics.csv")

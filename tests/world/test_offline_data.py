@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import probe
-from metrpo import algorithm, training
+from metrpo import training
 from metrpo.config import Config
 from metrpo.errors import ConfigError, TaskError
 from metrpo.presets import override
+from metrpo.stages import records
 from metrpo.world import collect as real
 from metrpo.world import offline_data
 
@@ -97,7 +98,7 @@ OFFLINE = override(
 def test_the_probe_is_learned_from_logs_alone(tmp_path, monkeypatch):
     """From 600 random transitions, without a real step: within a tenth of the Riccati return."""
     config = dataclasses.replace(OFFLINE, data=str(write(tmp_path / "log.npz")))
-    monkeypatch.setattr(algorithm, "evaluate", lambda *_: np.zeros(5))
+    monkeypatch.setattr(records, "evaluate", lambda *_: np.zeros(5))
     monkeypatch.setattr(real, "_episode", lambda *_: pytest.fail("a real step"))
     state = training.train(config)
     monkeypatch.undo()

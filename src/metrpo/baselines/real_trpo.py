@@ -12,7 +12,6 @@ import jax
 import numpy as np
 
 from metrpo import budget
-from metrpo.algorithm import Row, recorded_returns
 from metrpo.baselines import on_policy
 from metrpo.baselines.on_policy import Drawn
 from metrpo.config import AdvantageConfig, Config, TRPOConfig
@@ -25,6 +24,8 @@ from metrpo.policy.improvers.table import batch_of
 from metrpo.policy.value.table import Baseline, init_baseline
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of, rng_of
+from metrpo.stages.records import recorded_returns
+from metrpo.stages.state import Row
 from metrpo.types import Array, Trajectories
 from metrpo.world.task import Task
 

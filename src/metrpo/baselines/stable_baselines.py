@@ -18,13 +18,14 @@ from gymnasium.spaces import Box
 from gymnasium.wrappers import TransformObservation
 
 from metrpo import budget
-from metrpo.algorithm import Row, recorded_returns
 from metrpo.config import Config
 from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import MetrpoError
 from metrpo.policy.gaussian import Policy
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, rng_of
+from metrpo.stages.records import recorded_returns
+from metrpo.stages.state import Row
 from metrpo.world.env_returns import closing
 from metrpo.world.task import Task
 

@@ -18,7 +18,6 @@ import numpy as np
 import optax
 
 from metrpo import budget
-from metrpo.algorithm import Row, recorded_returns
 from metrpo.baselines import on_policy
 from metrpo.config import Config, FitConfig, GradientConfig, SVGConfig
 from metrpo.console.progress import SILENT, Progress
@@ -32,6 +31,8 @@ from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers.adam import ascend, init_moments
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of, rng_of
+from metrpo.stages.records import recorded_returns
+from metrpo.stages.state import Row
 from metrpo.types import Array, Episode, Normaliser, Transitions
 from metrpo.world import dataset as datasets
 from metrpo.world.task import Task

@@ -7,6 +7,7 @@ in float64; models and policy see them less an origin, which the first data deci
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -32,6 +33,11 @@ def origin_of(states: np.ndarray) -> np.ndarray:
 def relative(states: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """Real `states` [..., S] counted from `origin` [S], in float64; where it is 0 throughout, as they are."""
     return np.asarray(states, np.float64) - origin if origin.any() else states
+
+
+def of_real(act: Callable[[np.ndarray], np.ndarray], origin: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """`act`, which takes states counted from `origin`, for states as the environment gives them."""
+    return lambda state: act(relative(state, origin))
 
 
 def shifted(task: Task, origin: np.ndarray) -> Task:

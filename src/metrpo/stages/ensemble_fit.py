@@ -1,0 +1,69 @@
+"""The ensemble fitted to all real transitions, with members that diverge made anew."""
+
+from __future__ import annotations
+
+import logging
+
+import jax
+import numpy as np
+
+from metrpo.config import Config
+from metrpo.console.progress import Progress
+from metrpo.errors import DivergedError
+from metrpo.model import ensemble as ensembles
+from metrpo.model.ensemble import Ensemble, Networks
+from metrpo.model.fit import FitInfo, fit, refit
+from metrpo.seeds import Stage, key_of
+from metrpo.types import Array
+from metrpo.world import dataset as datasets
+from metrpo.world.dataset import Dataset
+from metrpo.world.task import Task
+
+_log = logging.getLogger("metrpo")
+
+
+def fit_ensemble(
+    config: Config, task: Task, networks: Networks, dataset: Dataset, iteration: int, progress: Progress
+) -> tuple[Ensemble, FitInfo]:
+    """The ensemble fitted to the dataset; members that diverge are fitted once more, from fresh weights.
+
+    Raises `DivergedError` where they diverge again.
+    """
+    init_key, fit_key = jax.random.split(key_of(config.seed, iteration, Stage.FIT))
+    every = config.fit.reinitialise_every
+    if every and (iteration - 1) % every == 0:
+        networks = fresh_networks(config, task, init_key)
+    e = config.ensemble
+    normaliser = ensembles.normaliser_of(dataset.train, e.std_floor, e.delta_std_floor, task.unseen)
+    train = jax.device_put(datasets.with_capacity(dataset.train, config.collect.max_train))
+    validation = jax.device_put(datasets.with_capacity(dataset.validation, config.collect.max_validation))
+
+    def tell(passes: int, losses: Array) -> None:
+        progress.update(passes, f"validation loss {float(np.mean(losses)):.4g}")
+
+    ensemble, info = fit(networks, normaliser, train, validation, config.fit, fit_key, tell)
+    if (survived := info.diverged & ~info.lost).any():
+        _log.warning("fit, iteration %d: %s diverged, and keep their best weights", iteration, _named(survived))
+    if info.lost.any():
+        _log.warning("fit, iteration %d: %s diverged: re-initialised and fitted again", iteration, _named(info.lost))
+        init_key, fit_key = jax.random.split(key_of(config.seed, iteration, Stage.RESET))
+        fresh = fresh_networks(config, task, init_key)
+        ensemble, info = refit(ensemble, info, fresh, train, validation, config.fit, fit_key)
+    if info.lost.any():
+        largest = float(np.abs(dataset.train.deltas).max())
+        raise DivergedError(
+            f"fit, iteration {iteration}: {_named(info.lost)}: expected finite weights and losses, got others, twice; "
+            f"start anew with a lower fit.learning_rate than {config.fit.learning_rate}, or look for outliers in the "
+            f"data (its largest change of a state is {largest:.3g})"
+        )
+    return ensemble, info
+
+
+def _named(members: np.ndarray) -> str:
+    return f"members {', '.join(map(str, np.flatnonzero(members)))}"
+
+
+def fresh_networks(config: Config, task: Task, key: Array) -> Networks:
+    """Networks that have seen nothing."""
+    e = config.ensemble
+    return ensembles.init(key, e.members, task.state_size, task.action_size, e.hidden, len(task.learned))

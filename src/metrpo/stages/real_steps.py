@@ -1,0 +1,160 @@
+"""Real episodes of the exploring policy: played, kept as they end, and left out where the environment fails."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from functools import partial
+from typing import Protocol
+
+import jax
+import numpy as np
+
+from metrpo import budget
+from metrpo.config import Config
+from metrpo.console.progress import SILENT, Progress
+from metrpo.errors import EpisodeError, NotFiniteError
+from metrpo.finite import naming
+from metrpo.policy import gaussian
+from metrpo.policy.gaussian import Policy
+from metrpo.policy.inputs import Inputs, folded, unfolded
+from metrpo.seeds import Stage, rng_of
+from metrpo.stages.state import State, inputs_for, on_host
+from metrpo.types import Episode
+from metrpo.world import collect as real
+from metrpo.world.origin import of_real
+from metrpo.world.task import Task
+
+
+class Log(Protocol):
+    """Where real episodes go as they end, and where those wait that nobody has learned from yet."""
+
+    def pending(self) -> list[Episode]:
+        """The episodes that wait."""
+
+    def append(self, episode: Episode) -> object:
+        """Keeps one more."""
+
+    def failures(self) -> Mapping[int, bool]:
+        """The episodes of this iteration in which the environment failed, and whether each is left out for good."""
+
+    def note_failures(self, failures: Mapping[int, bool]) -> None:
+        """Keeps them."""
+
+
+class Unkept:
+    """A log of nothing but the failures of one iteration."""
+
+    def __init__(self) -> None:
+        self._failures: Mapping[int, bool] = {}
+
+    def pending(self) -> list[Episode]:
+        """None."""
+        return []
+
+    def append(self, episode: Episode) -> None:
+        """Forgotten."""
+
+    def failures(self) -> Mapping[int, bool]:
+        """The last ones noted."""
+        return self._failures
+
+    def note_failures(self, failures: Mapping[int, bool]) -> None:
+        """Remembered."""
+        self._failures = dict(failures)
+
+
+def left_out(log: Log) -> int:
+    """Episodes of this iteration that are played no more, for the environment failed in them."""
+    return sum(log.failures().values())
+
+
+def collect(
+    config: Config,
+    task: Task,
+    state: State,
+    progress: Progress = SILENT,
+    log: Log | None = None,
+    at_least: int | None = None,
+) -> list[Episode]:
+    """The real episodes of the next iteration: those that wait in `log`, and more until they have enough steps.
+
+    Enough are `at_least`, or as many as the config asks for and its budget allows; an episode of more steps than the
+    config asks for is cut there, and so is the one that reaches the end of the budget. New ones go to `log` as they
+    end; what a run that was stopped has collected is not collected again.
+
+    An episode in which the environment gives NaN or infinity is left out for good: its seed would give the same again.
+    So is one that fails otherwise, but in its second try: the first ends the run. Raises `UnplayableError` when too
+    many are left out, `EpisodeError` for another failure.
+    """
+    enough = budget.steps_wanted(config, state.real_steps) if at_least is None else at_least
+    at_most = budget.steps_left(config, state.real_steps) if at_least is None else math.inf
+    progress.stage("collect", enough)
+    log = log or Unkept()
+    episodes = log.pending()
+    while sum(len(e.rewards) for e in episodes) < enough:
+        number = len(episodes) + left_out(log)
+        try:
+            with naming("collect", state.iteration + 1):
+                explorer = _explorer(config, task, state)
+                # Each episode has randomness of its own, so that it is the same one after any interruption.
+                rngs = (rng_of(config.seed, state.iteration + 1, Stage.COLLECT, n) for n in itertools.count(number))
+                steps = sum(len(e.rewards) for e in episodes)
+                longest = config.collect.steps
+                with closing(real.play(task, explorer, rngs, longest, progress.played, at_most - steps)) as played:
+                    _take(played, episodes, enough, log, progress)
+        except EpisodeError as error:
+            _note_failure(log, len(episodes) + left_out(log), error)
+    return episodes
+
+
+def _explorer(config: Config, task: Task, state: State) -> Callable[[np.random.Generator], real.Act]:
+    """What acts in an episode: the policy with noise on its parameters and its actions, drawn anew for each."""
+    inputs = inputs_for(config, task, state.dataset)
+    policies = on_host(state.policy), on_host(state.previous_policy)
+
+    def act(rng: np.random.Generator) -> real.Act:
+        mean = perturbed(*policies, config.collect.parameter_noise, rng, inputs)
+        return real.explore(of_real(mean, state.origin), config.collect, rng)
+
+    return act
+
+
+def _take(played: Iterator[Episode], episodes: list[Episode], enough: int, log: Log, progress: Progress) -> None:
+    """Adds what is `played` to `episodes` until they have `enough` steps."""
+    steps = sum(len(e.rewards) for e in episodes)
+    while steps < enough:
+        episodes.append(next(played))
+        log.append(episodes[-1])
+        steps += len(episodes[-1].rewards)
+        progress.update(steps)
+
+
+def _note_failure(log: Log, number: int, error: EpisodeError) -> None:
+    """Leaves an episode out, or raises its `error`: what was not the seed's fault may go better next time."""
+    failures = dict(log.failures())
+    hopeless = isinstance(error, NotFiniteError) or number in failures
+    failures[number] = hopeless
+    log.note_failures(failures)
+    if not hopeless:
+        raise error
+    real.leave_out(sum(failures.values()), error)
+
+
+def perturbed(
+    policy: Policy, previous: Policy, scale: float, rng: np.random.Generator, inputs: Inputs | None = None
+) -> real.Act:
+    """The mean action of the policy with its parameters perturbed (paper, appendix A.1.1).
+
+    Those that act on normalised states: an offset of the states would blow up the noise of raw ones.
+    """
+    if inputs is not None:
+        policy, previous = unfolded(policy, inputs), unfolded(previous, inputs)
+
+    def noisy(now: np.ndarray, before: np.ndarray) -> np.ndarray:
+        return now + scale * np.abs(now - before) * rng.standard_normal(now.shape)
+
+    perturbed = policy._replace(layers=jax.tree.map(noisy, policy.layers, previous.layers))
+    return partial(gaussian.mean, perturbed if inputs is None else folded(perturbed, inputs))
