@@ -110,7 +110,12 @@ def bench(tiny: bool, seconds: float, save: Save) -> None:
         complete = {key: values for key, values in taken.items() if len(values) == max(map(len, taken.values()))}
         known = {k: w._replace(bound=w.bound if (w.bound, "metrpo") in complete else None) for k, w in works.items()}
         timings = [measure._timing(key, "metrpo", v, known, complete) for (key, _), v in complete.items()]
-        save({"text": measure.Report({}, timings).text(), **measure.Report(measure._machine(), timings).record()})
+        save(
+            {
+                "text": measure.BenchReport({}, timings).text(),
+                **measure.BenchReport(measure._machine(), timings).record(),
+            }
+        )
 
     def turn(key: str) -> None:
         precision = makers[key][1]

@@ -139,9 +139,9 @@ def check() -> Links:
 
 def commands() -> str:
     """All commands in short, and a section for each: what --help-all prints, without its boxes."""
+    from metrpo.commands.command_table import NAMES
     from metrpo.commands.help import overview
     from metrpo.commands.parse import parse
-    from metrpo.commands.table import NAMES
 
     sections = (_command(name, _help(parse, name)) for name in NAMES)
     return "\n".join([f"```text\n{overview()}\n```\n", *sections])

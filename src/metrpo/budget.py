@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 
 from metrpo.config import Config
 
@@ -19,9 +20,14 @@ def steps_wanted(config: Config, real_steps: int) -> int:
 
 def finished(config: Config, iteration: int, real_steps: int) -> bool:
     """Whether the budget is spent after so many iterations and real steps."""
-    if config.real_steps:
+    if config.real_steps:  # 0: learns from offline data, for so many iterations
         return real_steps >= config.real_steps
     return iteration >= config.iterations
+
+
+def spent(config: Config, rows: Sequence[Mapping[str, float | None]]) -> bool:
+    """Whether a run with these rows of metrics has used up its budget."""
+    return bool(rows) and finished(config, int(rows[-1]["iteration"] or 0), int(rows[-1]["real_steps"] or 0))
 
 
 def iterations_left(config: Config, iteration: int, real_steps: int) -> int | None:

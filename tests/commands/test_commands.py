@@ -17,10 +17,10 @@ import numpy as np
 import pytest
 
 import metrpo
+from metrpo.commands.command_table import NAMES
 from metrpo.commands.default_dir import default_run_dir
 from metrpo.commands.main import main
 from metrpo.commands.parse import parse
-from metrpo.commands.table import NAMES
 from metrpo.config import Config
 from metrpo.launch.run_spec import RunSpec
 from metrpo.presets import preset
@@ -372,7 +372,7 @@ def test_a_new_command_is_one_file_and_one_row(tmp_path):
     package = tmp_path / "metrpo"
     shutil.copytree(Path(metrpo.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
     (package / "commands" / "greet.py").write_text(GREET)
-    table = package / "commands" / "table.py"
+    table = package / "commands" / "command_table.py"
     table.write_text(table.read_text().replace('        "doctor":', '        "greet": "Say hello",\n        "doctor":'))
 
     def run_there(*words: str) -> str:

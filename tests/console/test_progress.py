@@ -11,9 +11,9 @@ from rich.console import Console
 
 from metrpo.console.progress import (
     SILENT,
-    Guarded,
     LiveProgress,
     PlainProgress,
+    TolerantProgress,
     default_progress,
     duration,
     outcome,
@@ -58,7 +58,7 @@ def test_a_resumed_run_says_so(iteration, of, said):
     out = io.StringIO()
     for progress in (
         PlainProgress(out),
-        Guarded(PlainProgress(out)),
+        TolerantProgress(PlainProgress(out)),
         LiveProgress(Console(file=out, width=30)),
         SILENT,
     ):

@@ -21,7 +21,7 @@ import pytest
 import metrpo
 import probe
 from metrpo import config, presets
-from metrpo.commands import main, parse, table
+from metrpo.commands import command_table, main, parse
 from metrpo.commands.reproduce import Reproduce
 from metrpo.errors import TaskError
 from metrpo.run import machine
@@ -133,7 +133,7 @@ def test_commands_are_found():
 
 
 def known() -> set[str]:
-    return set(table.NAMES)
+    return set(command_table.NAMES)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_the_reference_is_complete():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"].keys() - {"dev"}
     assert set(re.findall(r"^\| `([a-z-]+)` \|", (ROOT / "docs" / "index.md").read_text(), re.MULTILINE)) == extras
     text = prepare["commands"]()
-    assert re.findall(r"^## metrpo (\w+)$", text, re.MULTILINE) == list(table.NAMES)
+    assert re.findall(r"^## metrpo (\w+)$", text, re.MULTILINE) == list(command_table.NAMES)
     assert "--ensemble.members INT" in text
     assert not set(text) & set("╭╮╰╯│")
 

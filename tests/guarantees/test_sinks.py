@@ -16,7 +16,7 @@ from tensorboardX.proto.event_pb2 import Event
 import tiny_run
 from metrpo.commands import main
 from metrpo.console import progress
-from metrpo.console.progress import Guarded, Progress
+from metrpo.console.progress import Progress, TolerantProgress
 from metrpo.run import directory
 from metrpo.run.metrics import Events, read_metrics
 from tiny_run import CONFIG, ITERATIONS, command_line, differing, process_line, result, train
@@ -141,7 +141,7 @@ class Broken(Progress):
 
 @pytest.mark.parametrize("name", ["begin", "stage", "update", "end", "close"])
 def test_a_display_that_breaks_costs_only_itself(name, tmp_path, expected, caplog):
-    train(CONFIG, tmp_path, Guarded(Broken(name)))
+    train(CONFIG, tmp_path, TolerantProgress(Broken(name)))
     assert differing(result(tmp_path), expected) == []
     message = "no progress from here on (RuntimeError: no fonts); training goes on"
     assert [r.getMessage() for r in caplog.records] == [message]

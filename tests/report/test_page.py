@@ -12,13 +12,13 @@ import pytest
 from metrpo.checks.health import examine
 from metrpo.commands.main import main
 from metrpo.config import ImagineConfig
-from metrpo.console.watch import standing
+from metrpo.console.live_table import standing
 from metrpo.errors import RunDirectoryError
 from metrpo.report import page as pages
 from metrpo.report.charts import Line, bars, chart, number, real_frame
 from metrpo.report.page import page, record
 from metrpo.run.curve import draw_curve
-from metrpo.run.find import Found, SeenRun, find, group
+from metrpo.run.find import FoundRuns, SeenRun, find, group
 from metrpo.run.metrics import read_metrics
 from places import RESULTS
 from seen_runs import CONFIG, ONE, Page, a_run, details, healthy, numbers_in
@@ -256,7 +256,7 @@ def test_no_numbers_are_too_odd():
         if trial % 5 == 0:
             odd = [{n: draw.choice(values) if "_" in n else v for n, v in row.items()} for row in details()]
             odd = [{**row, "real_steps": 3000 * row["iteration"]} for row in odd]
-            found = Found([SeenRun(Path("a"), CONFIG, rows, odd), SeenRun(Path("b"), ONE, rows)], [])
+            found = FoundRuns([SeenRun(Path("a"), CONFIG, rows, odd), SeenRun(Path("b"), ONE, rows)], [])
             text = page(found, Path())
             Page(text)
             assert not re.search(r'="[^"<>a-z]*\b(nan|inf)\b', text), "no coordinate is nan"

@@ -67,7 +67,7 @@ def fake(monkeypatch):
     monkeypatch.setattr(measure, "TURN", 0.0)
     monkeypatch.setattr(peers, "WORK", {"slowlib": ("fit-1024",)})
     monkeypatch.setattr(peers, "PEERS", ("slowlib",))
-    monkeypatch.setattr(peers, "Worker", FakeWorker)
+    monkeypatch.setattr(peers, "PeerWorker", FakeWorker)
     monkeypatch.setattr(peers, "is_installed", lambda: True)
 
 
@@ -144,6 +144,6 @@ def test_iterations_are_timed_and_their_compilations_counted(monkeypatch):
     assert measured.compilations[0] > 5
     assert measured.compilations[2] == 0
     assert all(0 < share < 1 for share in measured.outside)
-    text = measure.Report({}, [], measured).text()
+    text = measure.BenchReport({}, [], measured).text()
     assert "compilations: " in text
     assert "compile cache warm: 1.5 s" in text

@@ -62,7 +62,7 @@ def worker(tmp_path, monkeypatch):
         path = tmp_path / "worker.py"
         path.write_text(script)
         monkeypatch.setitem(peers.SCRIPTS, "pytorch", path)
-        return peers.Worker("pytorch")
+        return peers.PeerWorker("pytorch")
 
     return start
 
@@ -149,7 +149,7 @@ def test_a_python_that_does_not_start_is_reported(worker, monkeypatch, tmp_path)
 
 def test_unknown_peers_are_refused():
     with pytest.raises(MetrpoError, match="expected one of mbrl-lib, sb3-contrib, pytorch, got tensorflow"):
-        peers.Worker("tensorflow")
+        peers.PeerWorker("tensorflow")
 
 
 def test_the_environment_is_made_once(commands, tmp_path):

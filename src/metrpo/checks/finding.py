@@ -12,8 +12,7 @@ import numpy as np
 
 from metrpo.config import Config
 from metrpo.counting import counted
-from metrpo.run.find import column
-from metrpo.run.metrics import Row
+from metrpo.run.metrics import Row, column
 
 
 @dataclass(frozen=True)

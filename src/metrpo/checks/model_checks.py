@@ -9,8 +9,7 @@ import numpy as np
 
 from metrpo.checks.finding import Concern, after, horizons, iteration_at, losses_of, short, since_when
 from metrpo.config import Config
-from metrpo.run.find import column
-from metrpo.run.metrics import Row
+from metrpo.run.metrics import Row, column
 
 EXPLOITED = 0.5
 """Imagined above real return, in parts of the real one, mean over three iterations."""

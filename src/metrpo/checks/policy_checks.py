@@ -9,8 +9,7 @@ import numpy as np
 from metrpo.checks.finding import Concern, iteration_at, short, since_when, standard_error
 from metrpo.config import Config
 from metrpo.counting import counted
-from metrpo.run.find import column
-from metrpo.run.metrics import Row
+from metrpo.run.metrics import Row, column
 
 FELL = 0.25
 """Return below its best, in parts of the way from its worst to its best, means over two iterations."""

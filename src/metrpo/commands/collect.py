@@ -9,8 +9,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from metrpo.commands.attend import attended_run
 from metrpo.commands.options import Switch, require_at_least_one
-from metrpo.commands.stopping import attended_run
 from metrpo.counting import counted
 
 

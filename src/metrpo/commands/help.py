@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 from tyro.conf import arg
 
-from metrpo.commands.table import COMMANDS
+from metrpo.commands.command_table import COMMANDS
 
 
 def overview() -> str:

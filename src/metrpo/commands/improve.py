@@ -8,9 +8,9 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
+from metrpo.commands.attend import attended_run
 from metrpo.commands.options import Switch
 from metrpo.commands.output import as_json
-from metrpo.commands.stopping import attended_run
 from metrpo.console.interrupt import Interruptible
 
 

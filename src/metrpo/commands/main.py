@@ -11,9 +11,9 @@ import os
 import sys
 from collections.abc import Sequence
 
+from metrpo.commands.attend import say, say_how_to_go_on
+from metrpo.commands.command_table import handler
 from metrpo.commands.parse import parse
-from metrpo.commands.stopping import say, say_how_to_go_on
-from metrpo.commands.table import handler
 from metrpo.console.encoding import print_anywhere
 from metrpo.console.interrupt import Stopped
 from metrpo.console.progress import mute_broken_output

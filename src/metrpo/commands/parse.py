@@ -9,9 +9,9 @@ from typing import Any, NoReturn
 import tyro
 from tyro.conf import OmitSubcommandPrefixes
 
+from metrpo.commands.command_table import NAMES, options_class
 from metrpo.commands.help import overview, shown
 from metrpo.commands.options import FEW, RunOptions
-from metrpo.commands.table import NAMES, options_class
 from metrpo.commands.words import command_of, joined, lists_of, understood
 from metrpo.config import Config
 from metrpo.errors import MetrpoError

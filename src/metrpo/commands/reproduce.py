@@ -9,9 +9,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from metrpo.commands.attend import attended_runs
 from metrpo.commands.options import Switch, require_at_least_one
 from metrpo.commands.output import exit_code, printer
-from metrpo.commands.stopping import attended_runs
 from metrpo.launch.backend import Means
 
 

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from metrpo.commands.attend import attended_runs
 from metrpo.commands.options import Switch, require_file_alone
 from metrpo.commands.output import exit_code, printer
-from metrpo.commands.stopping import attended_runs
 from metrpo.config import Preset, System
 from metrpo.counting import counted
 from metrpo.launch.backend import Means

@@ -12,8 +12,8 @@ from typing import Annotated
 
 from tyro.conf import arg
 
+from metrpo.commands.attend import attended_run
 from metrpo.commands.options import RunOptions, Switch
-from metrpo.commands.stopping import attended_run
 from metrpo.config import Config
 from metrpo.console.interrupt import Interruptible
 from metrpo.errors import MetrpoError

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 from tyro.conf import Positional, arg
 
+from metrpo.commands.attend import attended_runs
 from metrpo.commands.options import Switch, require_at_least_one, require_file_alone
 from metrpo.commands.output import exit_code, printer
-from metrpo.commands.stopping import attended_runs
 from metrpo.config import Preset, System
 from metrpo.errors import ConfigError
 

@@ -42,7 +42,7 @@ class Watch:
 
 def run(command: Watch) -> int:
     """Returns the exit code."""
-    from metrpo.console.watch import standings_of, watch
+    from metrpo.console.live_table import standings_of, watch
     from metrpo.run.find import find
 
     if command.json:

@@ -12,7 +12,7 @@ import time
 from types import FrameType
 from typing import Any, Self
 
-from metrpo.console.progress import Guarded, Progress, Row
+from metrpo.console.progress import Measured, Progress, TolerantProgress
 
 PATIENCE = 5.0
 """Seconds that an episode has to end in when a signal asks to stop."""
@@ -48,7 +48,7 @@ def _inherited(number: int, process: int) -> bool:
     return True
 
 
-class Interruptible(Guarded):
+class Interruptible(TolerantProgress):
     """Progress that the loop reports to within a `with` block, and that ends the loop by `Stopped` once asked to.
 
     An iteration that has begun is finished and saved first. While real episodes are played, of which each is saved as
@@ -116,7 +116,7 @@ class Interruptible(Guarded):
         if self._asked is not None and self._collecting() and time.monotonic() - self._asked_at > PATIENCE:
             self._stop_if_asked()
 
-    def end(self, row: Row, seconds_left: float | None = None) -> None:
+    def end(self, row: Measured, seconds_left: float | None = None) -> None:
         """The iteration is saved."""
         super().end(row, seconds_left)
         self._stage, self.ended = None, True

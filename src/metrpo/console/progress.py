@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _log = logging.getLogger("metrpo")
-Row = Mapping[str, Any]
+Measured = Mapping[str, Any]
 
 
 class Progress:
@@ -45,7 +45,7 @@ class Progress:
     def played(self) -> None:
         """One more real step has been played, in the middle of an episode; a place to stop."""
 
-    def end(self, row: Row, seconds_left: float | None = None) -> None:
+    def end(self, row: Measured, seconds_left: float | None = None) -> None:
         """The iteration is finished with these metrics; about so many seconds remain."""
 
     def close(self) -> None:
@@ -74,7 +74,7 @@ class PlainProgress(Progress):
         """Prints the stage's name."""
         self._print(f"{self._heading}  {time.monotonic() - self._began:6.1f} s  {name}")
 
-    def end(self, row: Row, seconds_left: float | None = None) -> None:
+    def end(self, row: Measured, seconds_left: float | None = None) -> None:
         """Prints the iteration's results."""
         self._print(f"{self._heading}  {summary(row)}{_left(seconds_left)}")
 
@@ -122,7 +122,7 @@ class LiveProgress(Progress):
         if self._task is not None:
             self._bars.update(self._task, completed=done, note=note or self._last)
 
-    def end(self, row: Row, seconds_left: float | None = None) -> None:
+    def end(self, row: Measured, seconds_left: float | None = None) -> None:
         """Leaves a line with the iteration's results above the bar."""
         self._clear()
         self._bars.console.print(f"[bold]{self._heading}[/]  {summary(row)}", highlight=False, soft_wrap=True)
@@ -139,7 +139,7 @@ class LiveProgress(Progress):
         self._task = None
 
 
-class Guarded(Progress):
+class TolerantProgress(Progress):
     """Another progress, of which nothing is shown any more once it fails: a closed pipe must not cost hours."""
 
     def __init__(self, shown: Progress) -> None:
@@ -161,7 +161,7 @@ class Guarded(Progress):
         """Passed on."""
         self._pass_on(lambda shown: shown.update(done, note))
 
-    def end(self, row: Row, seconds_left: float | None = None) -> None:
+    def end(self, row: Measured, seconds_left: float | None = None) -> None:
         """Passed on."""
         self._pass_on(lambda shown: shown.end(row, seconds_left))
 
@@ -204,7 +204,7 @@ def default_progress() -> Progress:
     return LiveProgress() if sys.stdout is not None and sys.stdout.isatty() else PlainProgress()
 
 
-def summary(row: Row) -> str:
+def summary(row: Measured) -> str:
     """One line with the numbers of an iteration that a person follows."""
     parts = [
         f"{row.get('real_steps', 0):>7,} real steps",
@@ -220,7 +220,7 @@ def summary(row: Row) -> str:
     return "  ".join([*parts, duration(seconds)] if seconds else parts)
 
 
-def outcome(row: Row, run_dir: Path) -> str:
+def outcome(row: Measured, run_dir: Path) -> str:
     """What the last iteration says of a whole run, in a line."""
     after = f"after {row['real_steps']:,} real steps"
     if not _is_missing(row.get("return_real")):
@@ -233,12 +233,12 @@ def outcome(row: Row, run_dir: Path) -> str:
     )
 
 
-def _has_no_environment(row: Row) -> bool:
+def _has_no_environment(row: Measured) -> bool:
     """Only another program can play."""
     return not row.get("failed_evaluation") and "return_imagined" in row
 
 
-def earned(row: Row) -> str:
+def earned(row: Measured) -> str:
     """The real return of an iteration, or what was collected where only another program can play."""
     if _is_missing(row.get("return_real")):
         return f"collected {_number(row.get('return_collected'))}"

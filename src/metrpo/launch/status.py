@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from metrpo import budget
 from metrpo.console.progress import duration, earned
 from metrpo.launch.run_spec import RunSpec
 from metrpo.run.metrics import Row, read_metrics
@@ -27,12 +28,7 @@ def is_finished(run: RunSpec, out: Path) -> bool:
 
 def has_spent(run: RunSpec, rows: Sequence[Row]) -> bool:
     """Whether these rows are the whole run's."""
-    config = run.config
-    if not rows:
-        return False
-    if config.real_steps:  # 0: learns from a log, for so many iterations
-        return int(rows[-1]["real_steps"] or 0) >= config.real_steps
-    return int(rows[-1]["iteration"] or 0) >= config.iterations
+    return budget.spent(run.config, rows)
 
 
 def standing(run: RunSpec, rows: Sequence[Row]) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from metrpo.chart_style import COLOURS, GREY, IMAGINED, REAL, tidy
 from metrpo.launch.run_spec import RunSpec
 from metrpo.paper.figures import FIGURES, PAPER_REAL_STEPS, PAPER_SECONDS, Figure
 from metrpo.paper.summary import Curves, curves_of, mean_curve
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Picture
 
-_COLOURS = ("#1f5fa8", "#d9772b", "#3f8f5f", "#b0413e", "#7a5aa6", "#8a6d3b")
-_REAL, _IMAGINED = _COLOURS[:2]
 _COLUMNS = 3
 """Panels side by side, so that a page's width still shows them."""
 
@@ -50,7 +49,7 @@ def _draw_curves(picture: Picture, figure: Figure, curves: list[Curves]) -> None
     labels = list(figure.systems)
     for axes, task in zip(_panels(picture, len(tasks)), tasks, strict=True):
         for c in (c for c in curves if c.task == task):
-            _draw_band(axes, c, _COLOURS[labels.index(c.label)], figure.log_steps)
+            _draw_band(axes, c, COLOURS[labels.index(c.label)], figure.log_steps)
         axes.set_title(task, fontsize=11)
         axes.set_xlabel("real steps" if figure.log_steps else "real steps (thousands)")
         axes.set_ylabel("return")
@@ -82,12 +81,12 @@ def _draw_overfitting(picture: Picture, figure: Figure, curves: list[Curves]) ->
         for axes, (steps, real), (_, imagined), run in zip(
             row, c.column("return_real"), c.column("return_imagined"), c.runs, strict=False
         ):
-            axes.plot(steps / 1000, imagined, "s-", color=_IMAGINED, markersize=4, label="imagined")
-            axes.plot(steps / 1000, real, "o-", color=_REAL, markersize=4, label="real")
+            axes.plot(steps / 1000, imagined, "s-", color=IMAGINED, markersize=4, label="imagined")
+            axes.plot(steps / 1000, real, "o-", color=REAL, markersize=4, label="real")
             axes.set_title(f"{c.task}, {c.label}, seed {run.seed}", fontsize=10)
             axes.set_ylabel("return")
             axes.set_xlabel("real steps (thousands)")
-            _tidy(axes)
+            tidy(axes)
         for axes in row[len(c.runs) :]:
             axes.set_axis_off()
     grid[0][0].legend(frameon=False, fontsize=9)
@@ -101,8 +100,8 @@ def _draw_wall_clock(picture: Picture, figure: Figure, curves: list[Curves]) -> 
         ours = [seconds[-1] / steps[-1] * 1000 for steps, seconds in c.column("wall_seconds")]
         theirs = PAPER_SECONDS[c.task] / PAPER_REAL_STEPS[c.task] * 1000
         for values, colour, label in (
-            (ours, _REAL, "these runs"),
-            ([theirs], "#8a8f98", "paper (1 K80, 4 virtual CPUs)"),
+            (ours, REAL, "these runs"),
+            ([theirs], GREY, "paper (1 K80, 4 virtual CPUs)"),
         ):
             axes.plot([i] * len(values), values, "o", color=colour, label=None if i else label)
             note = f"{float(np.mean(values)):.3g}"
@@ -124,7 +123,7 @@ def _panels(picture: Picture, count: int) -> list[Axes]:
     columns = min(count, _COLUMNS)
     panels = list(picture.subplots(-(-count // columns), columns, squeeze=False).flat)
     for axes in panels:
-        _tidy(axes)
+        tidy(axes)
     for axes in panels[count:]:
         axes.set_axis_off()
     return panels[:count]
@@ -139,9 +138,3 @@ def _logarithmic(axes: Axes) -> None:
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_minor_locator(LogLocator(subs="all"))
     axes.xaxis.set_minor_formatter("")
-
-
-def _tidy(axes: Axes) -> None:
-    axes.grid(True, color="#dddddd", linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)

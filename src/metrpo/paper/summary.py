@@ -11,7 +11,7 @@ import numpy as np
 from metrpo.launch.run_spec import RunSpec
 from metrpo.launch.status import rows_of
 from metrpo.paper.figures import FIGURES
-from metrpo.run.metrics import Row
+from metrpo.run.metrics import Row, column
 from metrpo.statistics import (
     at_steps,
     common_grid,
@@ -37,7 +37,7 @@ class Curves(NamedTuple):
 
     def column(self, name: str) -> list[tuple[np.ndarray, np.ndarray]]:
         """(real steps, values) of every seed."""
-        return [(_values(rows, "real_steps"), _values(rows, name)) for rows in self.rows]
+        return [(column(rows, "real_steps"), column(rows, name)) for rows in self.rows]
 
 
 def curves_of(figure: str, runs: Sequence[RunSpec], out: Path) -> list[Curves]:
@@ -172,8 +172,3 @@ def _steps_to(curves: Curves, level: float) -> float:
     grid = np.unique(np.concatenate([steps for steps, _ in seeds]))
     grid = grid[(grid >= first) & (grid <= last)]
     return steps_to_reach(grid, at_steps(seeds, grid).mean(axis=0), level)
-
-
-def _values(rows: Sequence[Row], name: str) -> np.ndarray:
-    values = [row.get(name) for row in rows]
-    return np.array([np.nan if v is None else v for v in values], dtype=float)

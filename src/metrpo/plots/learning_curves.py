@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from metrpo.chart_style import COLOURS, tidy
 from metrpo.counting import counted
 from metrpo.errors import ConfigError
 from metrpo.plots.bands import RATIOS, curve, is_far
@@ -23,7 +24,6 @@ FORMATS = ("png", "svg", "pdf")
 _DOTS = 25
 """Most points of a line that are marked each."""
 
-_COLOURS = ("#1f5fa8", "#d9772b", "#3f8f5f", "#b0413e", "#7a5aa6", "#8a6d3b")
 _NAMES = {
     "real_steps": "real steps",
     "wall_seconds": "wall-clock time (s)",
@@ -70,7 +70,7 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
         log = is_far(x, [seed[0][-1] for g in of_task for seed in curve(g, x, y).seeds])
         for i, g in enumerate(of_task):
             c = curve(g, x, y, log, log_y)
-            style = {"color": _COLOURS[i % len(_COLOURS)], "linestyle": ("-", "--", ":")[i // len(_COLOURS) % 3]}
+            style = {"color": COLOURS[i % len(COLOURS)], "linestyle": ("-", "--", ":")[i // len(COLOURS) % 3]}
             if len(c.seeds) > 1:
                 for seed in c.seeds:
                     axes.plot(*seed, **style, linewidth=0.7, alpha=0.4)
@@ -81,9 +81,7 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
         axes.set_title(task, fontsize=11, parse_math=False)
         axes.set_xlabel(_NAMES.get(x, x))
         axes.set_ylabel(_NAMES.get(y, y), parse_math=False)
-        axes.grid(True, color="#dddddd", linewidth=0.7)
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
+        tidy(axes)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         if x == "iteration":
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -15,14 +15,14 @@ from metrpo.report import charts
 from metrpo.report.charts import number
 from metrpo.report.panels import Budget, Seen, task_section
 from metrpo.report.style import STYLE
-from metrpo.run.find import Found, Group, SeenRun, group, is_finished, settings
+from metrpo.run.find import FoundRuns, Group, SeenRun, group, is_finished, settings
 
 VIDEO_BYTES = 3_000_000
 """Most bytes of videos inside of a page, all together; those beyond are links. In base64 they take a third more."""
 
 
 @np.errstate(all="ignore")  # 1e300 in a file is no reason to complain
-def page(found: Found, folder: Path) -> str:
+def page(found: FoundRuns, folder: Path) -> str:
     """The report of some runs as HTML; `folder` is where it will lie, for links to videos.
 
     Runs without a finished iteration are named beside those that could not be read.
@@ -52,7 +52,7 @@ def page(found: Found, folder: Path) -> str:
     )
 
 
-def record(found: Found) -> dict[str, Any]:
+def record(found: FoundRuns) -> dict[str, Any]:
     """What the report says, for scripts: the runs with their numbers and warnings, what was skipped, and how the groups
     of runs differ. NaN is None."""
     groups = group([run for run in found.runs if run.rows])
@@ -96,7 +96,7 @@ def _summary(seen: list[Seen]) -> str:
     return f"{counted(len(seen), 'run')}, {counted(steps, 'real step')} together{open_}."
 
 
-def _health(seen: list[Seen], found: Found) -> str:
+def _health(seen: list[Seen], found: FoundRuns) -> str:
     warned = [s for s in seen if any(c.level == "warning" for c in s.concerns)]
     noted = [s for s in seen if s.concerns and s not in warned]
     several = len({s.group.task for s in seen}) > 1
@@ -186,7 +186,7 @@ def _different(groups: list[Group]) -> dict[str, list[object]]:
     return {name: [one[name][1] if name in one else usual[name] for one in changed] for name in names}
 
 
-def _skipped(found: Found) -> list[tuple[Path, str]]:
+def _skipped(found: FoundRuns) -> list[tuple[Path, str]]:
     fresh = [(run.path, "no finished iteration yet") for run in found.runs if not run.rows]
     return [*((s.path, s.why) for s in found.skipped), *fresh]
 

@@ -1,9 +1,15 @@
 """The report's style sheet: one column on a phone, a grid on a desk, light or dark as the reader has it."""
 
-STYLE = """
-:root{--bg:#fbfbfa;--card:#fff;--ink:#1d2126;--soft:#626a74;--rule:#e2e4e7;--grid:#eceef0;
+from metrpo.chart_style import COLOURS
+
+_NUMBERED = ";".join(f"--c{i}:{colour}" for i, colour in enumerate(COLOURS))
+
+STYLE = (
+    """:root{--bg:#fbfbfa;--card:#fff;--ink:#1d2126;--soft:#626a74;--rule:#e2e4e7;--grid:#eceef0;
 --bad:#b3261e;--badbg:#fdeeec;--good:#22713f;--goodbg:#e9f6ed;--note:#7a5b00;
---c0:#1f5fa8;--c1:#d9772b;--c2:#3f8f5f;--c3:#b0413e;--c4:#7a5aa6;--c5:#8a6d3b}
+"""
+    + _NUMBERED
+    + """}
 @media(prefers-color-scheme:dark){:root{--bg:#14171a;--card:#1c2024;--ink:#e6e8ea;--soft:#9aa3ad;--rule:#31373d;
 --grid:#2a2f35;--bad:#ff8f85;--badbg:#38201e;--good:#7fd39b;--goodbg:#1a3022;--note:#e6c25a;
 --c0:#6fa8ea;--c1:#f0a05e;--c2:#74c293;--c3:#ea8782;--c4:#b79be3;--c5:#cbab72}}
@@ -58,3 +64,4 @@ th,td{padding:.35rem .5rem}
 #runs th:first-child{max-width:9rem}}
 @media print{details>*{display:block}}
 """.strip()
+)

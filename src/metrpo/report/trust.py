@@ -10,7 +10,8 @@ from metrpo.checks.finding import after, horizons
 from metrpo.report.caption import figure
 from metrpo.report.charts import Line, chart, number
 from metrpo.report.heatmap import heat
-from metrpo.run.find import SeenRun, column
+from metrpo.run.find import SeenRun
+from metrpo.run.metrics import column
 
 _STRONGEST = 0.6
 """Opacity of a cell, at most: its number stays legible, on light and on dark."""

@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from metrpo.chart_style import GREEN, GREY, IMAGINED, REAL, tidy
 from metrpo.counting import counted
 from metrpo.run.files import atomic_write
-from metrpo.run.metrics import Row
+from metrpo.run.metrics import Row, column
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 NOTHING: Mapping[str, float] = MappingProxyType({})
-_REAL, _IMAGINED, _COLLECTED, _SHARE = "#1f5fa8", "#d9772b", "#8a8f98", "#3f8f5f"
+_COLLECTED, _SHARE = GREY, GREEN
 
 
 def draw_curve(rows: Sequence[Row], path: Path, title: str, yardsticks: Mapping[str, float] = NOTHING) -> None:
@@ -32,15 +33,15 @@ def draw_curve(rows: Sequence[Row], path: Path, title: str, yardsticks: Mapping[
     )  # slow to import; without pyplot there is no global state and no display needed
 
     figure = Figure(figsize=(9, 7), dpi=150, layout="constrained")
-    steps = _column(rows, "real_steps") / 1000
-    if any(np.isfinite(_column(rows, name)).any() for name in ("gap", "fraction_improved")):
+    steps = column(rows, "real_steps") / 1000
+    if any(np.isfinite(column(rows, name)).any() for name in ("gap", "fraction_improved")):
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=[2.2, 1])
         _draw_gap(below, steps, rows)
     else:  # a method without models
         above = below = figure.subplots()
     _draw_returns(above, steps, rows, yardsticks)
     figure.suptitle(title, fontsize=14, fontweight="bold", parse_math=False)  # a task's name is no formula
-    best = _column(rows, "return_real")
+    best = column(rows, "return_real")
     if np.isfinite(best).any():
         above.set_title(
             f"last {best[-1]:.1f}, best {np.nanmax(best):.1f} after {counted(len(rows), 'iteration')}",
@@ -48,7 +49,7 @@ def draw_curve(rows: Sequence[Row], path: Path, title: str, yardsticks: Mapping[
             color="#555555",
         )
     for axes in {above, below}:
-        _tidy(axes)
+        tidy(axes)
     below.set_xlabel("real steps (thousands)")
     below.set_xlim(left=0)
     picture = io.BytesIO()
@@ -58,12 +59,12 @@ def draw_curve(rows: Sequence[Row], path: Path, title: str, yardsticks: Mapping[
 
 def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row], yardsticks: Mapping[str, float]) -> None:
     real, std, collected, imagined = (
-        _column(rows, name) for name in ("return_real", "return_real_std", "return_collected", "return_imagined")
+        column(rows, name) for name in ("return_real", "return_real_std", "return_collected", "return_imagined")
     )
     played = bool(np.isfinite(real).any())  # not where another program does
     if played:
         axes.fill_between(
-            steps, real - std, real + std, color=_REAL, alpha=0.15, linewidth=0, label="± 1 std over episodes"
+            steps, real - std, real + std, color=REAL, alpha=0.15, linewidth=0, label="± 1 std over episodes"
         )
     axes.plot(
         steps,
@@ -74,9 +75,9 @@ def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row], yardsticks
         label="collected (with exploration noise)",
     )
     if np.isfinite(imagined).any():
-        axes.plot(steps, imagined, "s-", color=_IMAGINED, linewidth=1.3, markersize=4, label="imagined (models)")
+        axes.plot(steps, imagined, "s-", color=IMAGINED, linewidth=1.3, markersize=4, label="imagined (models)")
     if played:
-        axes.plot(steps, real, "o-", color=_REAL, linewidth=2.2, markersize=5, label="real (deterministic policy)")
+        axes.plot(steps, real, "o-", color=REAL, linewidth=2.2, markersize=5, label="real (deterministic policy)")
     for (name, level), style in zip(yardsticks.items(), ("--", ":"), strict=False):
         axes.axhline(level, color="#333333", linewidth=1.1, linestyle=style, label=f"{name} ({level:.4g})")
     axes.set_ylabel("return of an episode")
@@ -102,16 +103,16 @@ def _frame(real: np.ndarray, others: np.ndarray, flattens: bool = True) -> tuple
 
 
 def _draw_gap(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
-    gap, share = _column(rows, "gap"), axes
+    gap, share = column(rows, "gap"), axes
     if np.isfinite(gap).any():
         axes.axhline(0, color="#333333", linewidth=0.8)
-        axes.fill_between(steps, 0, gap, color=_IMAGINED, alpha=0.2, linewidth=0)
-        axes.plot(steps, gap, "s-", color=_IMAGINED, linewidth=1.3, markersize=4, label="gap: imagined - real")
+        axes.fill_between(steps, 0, gap, color=IMAGINED, alpha=0.2, linewidth=0)
+        axes.plot(steps, gap, "s-", color=IMAGINED, linewidth=1.3, markersize=4, label="gap: imagined - real")
         axes.set_ylabel("gap")
         share = axes.twinx()
     share.plot(
         steps,
-        100 * _column(rows, "fraction_improved"),
+        100 * column(rows, "fraction_improved"),
         "^:",
         color=_SHARE,
         markersize=4,
@@ -131,14 +132,3 @@ def _draw_gap(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
         bbox_to_anchor=(0, 1),
         borderaxespad=0.2,
     )
-
-
-def _tidy(axes: Axes) -> None:
-    axes.grid(True, color="#dddddd", linewidth=0.7)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _column(rows: Sequence[Row], name: str) -> np.ndarray:
-    values = [row.get(name) for row in rows]
-    return np.array([np.nan if value is None else value for value in values], dtype=float)

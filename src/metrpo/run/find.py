@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import csv
-import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +15,7 @@ from metrpo import budget
 from metrpo.config import Config, difference, from_json
 from metrpo.errors import ConfigError, RunDirectoryError
 from metrpo.run import yardstick_record
-from metrpo.run.metrics import Row, read_metrics
+from metrpo.run.metrics import Row, column, read_metrics
 
 _INSIDE = {"checkpoints", "episodes", "events", ".git", ".venv", "node_modules", "__pycache__"}
 """Folders that hold no runs."""
@@ -50,14 +49,14 @@ class Skipped(NamedTuple):
     why: str
 
 
-class Found(NamedTuple):
+class FoundRuns(NamedTuple):
     """The runs under some folders, in the order of their paths."""
 
     runs: list[SeenRun]
     skipped: list[Skipped]
 
 
-def find(paths: Sequence[Path]) -> Found:
+def find(paths: Sequence[Path]) -> FoundRuns:
     """The runs that `paths` are or have inside, each once.
 
     A run is a folder with a config.json and, once an iteration is finished, a metrics.csv. Raises `RunDirectoryError`
@@ -84,7 +83,7 @@ def find(paths: Sequence[Path]) -> Found:
         raise RunDirectoryError(
             f"{where}: expected a run (config.json and metrics.csv), got none; start one with: metrpo train TASK"
         )
-    return Found(runs, skipped)
+    return FoundRuns(runs, skipped)
 
 
 def read(folder: Path) -> SeenRun:
@@ -118,18 +117,9 @@ def _details(file: Path) -> list[Row]:
     return rows
 
 
-def column(rows: Iterable[Row], name: str) -> np.ndarray:
-    """One number a row [len(rows)]; NaN where there is none."""
-    values = [row.get(name) for row in rows]
-    return np.array([math.nan if v is None else v for v in values], dtype=float)
-
-
 def is_finished(run: SeenRun) -> bool:
     """Whether the budget is spent, as far as the metrics say."""
-    if not run.rows:
-        return False
-    last = run.rows[-1]
-    return budget.finished(run.config, int(last["iteration"] or 0), int(last["real_steps"] or 0))
+    return budget.spent(run.config, run.rows)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ NEEDED = ("jax", "jaxlib", "mujoco", "gymnasium", "numpy", "optax")
 
 
 @dataclass
-class Diagnosis:
+class Installation:
     """What this machine has and lacks."""
 
     versions: dict[str, str | None]
@@ -44,10 +44,12 @@ class Diagnosis:
         return "\n".join([*lines, "training cannot work here" if self.problems else "training can work here"])
 
 
-def diagnose() -> Diagnosis:
+def diagnose() -> Installation:
     """Looks at versions, devices, OpenGL and the encoder of this machine."""
     versions: dict[str, str | None] = {"python": platform.python_version(), "metrpo": metrpo_version()}
-    found = Diagnosis(versions | {n: _version(n) for n in NEEDED}, cores(), [], video.gl_backend(), video.has_encoder())
+    found = Installation(
+        versions | {n: _version(n) for n in NEEDED}, cores(), [], video.gl_backend(), video.has_encoder()
+    )
     for name in NEEDED:
         try:
             load_mujoco() if name == "mujoco" else importlib.import_module(name)
@@ -65,7 +67,7 @@ def diagnose() -> Diagnosis:
     return found
 
 
-def _look_for_devices(found: Diagnosis) -> None:
+def _look_for_devices(found: Installation) -> None:
     try:
         found.devices = device_names()
     except MetrpoError as error:

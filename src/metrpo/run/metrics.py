@@ -10,9 +10,11 @@ import re
 import socket
 import struct
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from metrpo.counting import counted
 from metrpo.errors import RunDirectoryError
@@ -95,6 +97,16 @@ def read_metrics(path: str | Path) -> list[Row]:
         return [dict(zip(columns, map(_parse, line), strict=True)) for line in lines]
     except (ValueError, csv.Error) as error:
         raise RunDirectoryError(f"{path}: expected a table of numbers, got something else ({error})") from None
+
+
+def numbers(values: Iterable[float | None]) -> np.ndarray:
+    """As an array, with NaN where there is none."""
+    return np.array([math.nan if value is None else value for value in values], dtype=float)
+
+
+def column(rows: Iterable[Row], name: str) -> np.ndarray:
+    """One number a row [len(rows)]; NaN where there is none."""
+    return numbers(row.get(name) for row in rows)
 
 
 def checked(rows: Any, iteration: int) -> list[Row]:

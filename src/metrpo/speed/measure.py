@@ -19,11 +19,10 @@ from typing import Any
 import jax
 
 from metrpo import training
+from metrpo.launch.status import Tell
 from metrpo.run.directory import RunDirectory
 from metrpo.run.machine import cores, device_names
 from metrpo.speed import ours, peers
-
-Tell = Callable[[str], None]
 
 TURN = 1.0
 """Seconds for which one piece of work is repeated in a round; what takes longer is done once."""
@@ -64,7 +63,7 @@ class Iterations:
 
 
 @dataclass(frozen=True)
-class Report:
+class BenchReport:
     """What was measured, and where."""
 
     machine: dict[str, Any]
@@ -72,10 +71,10 @@ class Report:
     iterations: Iterations | None = None
 
     @staticmethod
-    def of(record: dict[str, Any]) -> Report:
+    def of(record: dict[str, Any]) -> BenchReport:
         """The report that `record` was taken of."""
         iterations = record["iterations"] and Iterations(**record["iterations"])
-        return Report(record["machine"], [Timing(**timing) for timing in record["timings"]], iterations)
+        return BenchReport(record["machine"], [Timing(**timing) for timing in record["timings"]], iterations)
 
     def record(self) -> dict[str, Any]:
         """For a script to read."""
@@ -120,7 +119,7 @@ def _row(t: Timing) -> tuple[str, ...]:
     )
 
 
-def bench(with_peers: bool, rounds: int, whole_iterations: bool, tell: Tell = lambda text: None) -> Report:
+def bench(with_peers: bool, rounds: int, whole_iterations: bool, tell: Tell = lambda text: None) -> BenchReport:
     """Times every piece of work once a round, ours and the peers' in turns, so that all see the same machine.
 
     Raises `MetrpoError` when the peers' environment cannot be made or a peer fails.
@@ -132,7 +131,7 @@ def bench(with_peers: bool, rounds: int, whole_iterations: bool, tell: Tell = la
         if with_peers:
             if not peers.is_installed():
                 tell("installing the peers, once")
-            workers = {name: stack.enter_context(peers.Worker(name)) for name in peers.PEERS}
+            workers = {name: stack.enter_context(peers.PeerWorker(name)) for name in peers.PEERS}
         available = ours.works()
         for name, make in available.items():
             tell(f"preparing {name}")
@@ -149,7 +148,7 @@ def bench(with_peers: bool, rounds: int, whole_iterations: bool, tell: Tell = la
                 seconds[key].append(_turn(run))
     timings = [_timing(name, who, values, works, seconds) for (name, who), values in seconds.items()]
     iterations = _iterations(tell) if whole_iterations else None
-    return Report(_machine(), timings, iterations)
+    return BenchReport(_machine(), timings, iterations)
 
 
 def _turn(run: Callable[[], float]) -> float:
@@ -165,7 +164,7 @@ def _turn(run: Callable[[], float]) -> float:
     return statistics.median(seconds or [first])
 
 
-def _measure(worker: peers.Worker, work: str) -> float:
+def _measure(worker: peers.PeerWorker, work: str) -> float:
     return worker.measure(work, 1)[0]
 
 

@@ -117,7 +117,7 @@ def _isolated() -> dict[str, str]:
     return kept | {"PYTHONNOUSERSITE": "1"}
 
 
-class Worker:
+class PeerWorker:
     """One peer's process, a context manager; it may use all cores of this process and rests between requests.
 
     Raises `MetrpoError` for an unknown peer, and (on entering) when the peers' environment cannot be made.
@@ -130,7 +130,7 @@ class Worker:
         self._process: subprocess.Popen[str] | None = None
         self._stderr: IO[str] | None = None
 
-    def __enter__(self) -> Worker:
+    def __enter__(self) -> PeerWorker:
         """Starts the process."""
         python = environment()
         # A file, for nobody empties a pipe while the worker works.
@@ -186,7 +186,7 @@ class Worker:
         return [float(seconds) for seconds in answer["seconds"]]
 
     def _running(self) -> tuple[subprocess.Popen[str], IO[str]]:
-        assert self._process is not None, "a Worker works between `with` and the end of its block"
+        assert self._process is not None, "a PeerWorker works between `with` and the end of its block"
         assert self._stderr is not None
         return self._process, self._stderr
 

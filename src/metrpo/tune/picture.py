@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from metrpo.chart_style import BLUE, GREEN, ORANGE, RED, tidy
 from metrpo.counting import counted
 from metrpo.run.files import atomic_write
 from metrpo.tune.results import Record, Tuned
@@ -17,7 +18,7 @@ from metrpo.tune.space import Choices, Span
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_COMPLETE, _PRUNED, _FAILED, _BEST = "#1f5fa8", "#d9772b", "#b0413e", "#3f8f5f"
+_COMPLETE, _PRUNED, _FAILED, _BEST = BLUE, ORANGE, RED, GREEN
 _COLUMNS = 3
 
 
@@ -43,9 +44,7 @@ def draw(tuned: Tuned, path: Path) -> bool:
         axes.set_axis_off()
     for axes in (first, *panels[: len(names)]):
         axes.set_ylabel("return")
-        axes.grid(True, color="#dddddd", linewidth=0.7)
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
+        tidy(axes)
     figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     title = f"{tuned.search.task}: {counted(len(tuned.records), 'trial')} of {counted(len(tuned.search.seeds), 'seed')}"
     figure.suptitle(title, fontsize=12, fontweight="bold", parse_math=False)

@@ -21,8 +21,8 @@ from metrpo.tune.search import OBJECTIVE, Search
 if TYPE_CHECKING:
     from optuna import Study
 
-State = Literal["complete", "pruned", "failed"]
-_STATES: dict[str, State] = {"COMPLETE": "complete", "PRUNED": "pruned", "FAIL": "failed"}
+TrialState = Literal["complete", "pruned", "failed"]
+_STATES: dict[str, TrialState] = {"COMPLETE": "complete", "PRUNED": "pruned", "FAIL": "failed"}
 PICTURE = "tune.png"
 _WIDE = 160
 """Columns of the table where no terminal says how many there are."""
@@ -37,7 +37,7 @@ class Record:
     """A trial that is over."""
 
     number: int
-    state: State
+    state: TrialState
     value: float | None
     """What it is worth (`OBJECTIVE`), or was when it was pruned."""
     returns: list[float]

@@ -11,12 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+from metrpo import budget
 from metrpo.config import Config, Preset, System, flatten
 from metrpo.errors import ConfigError
 from metrpo.launch.grid import flat, seeds_of
 from metrpo.launch.run_spec import RunSpec
 from metrpo.presets import override, preset
-from metrpo.run.metrics import Row
+from metrpo.run.metrics import Row, numbers
 from metrpo.tune.space import Span, span
 from metrpo.world.registry import get_task
 
@@ -117,11 +118,7 @@ class Search:
 
     def is_spent(self, rows: Sequence[Row]) -> bool:
         """Whether a run with these rows of metrics has used up its budget."""
-        if not rows:
-            return False
-        if self.real_steps is not None:
-            return int(rows[-1]["real_steps"] or 0) >= self.real_steps
-        return int(rows[-1]["iteration"] or 0) >= (self.iterations or self.base.iterations)
+        return budget.spent(self.base, rows)
 
     def record(self) -> dict[str, Any]:
         """What makes two searches the same, as JSON; more trials make no other one."""
@@ -139,7 +136,7 @@ def worth(returns: Sequence[Sequence[Row]], iterations: int | None = None) -> li
     found = []
     for rows in returns:
         last = [row.get("return_real") for row in rows[:iterations][-LAST:]]
-        found.append(math.fsum(math.nan if r is None else r for r in last) / len(last))
+        found.append(math.fsum(numbers(last)) / len(last))
     return found
 
 

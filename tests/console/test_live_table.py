@@ -19,8 +19,8 @@ from rich.console import Console
 
 from metrpo.commands.main import main
 from metrpo.config import Config, EnsembleConfig
-from metrpo.console import watch as watching
-from metrpo.console.watch import SPARKS, is_running, sparkline, standing, watch
+from metrpo.console import live_table as watching
+from metrpo.console.live_table import SPARKS, is_running, sparkline, standing, watch
 from metrpo.plots.bands import curve
 from metrpo.policy.gaussian import Policy
 from metrpo.run.directory import RunDirectory

@@ -21,7 +21,8 @@ from metrpo import budget
 from metrpo.checks.health import examine
 from metrpo.console.progress import duration
 from metrpo.run.episodes import waiting_steps
-from metrpo.run.find import Found, SeenRun, find, is_finished, told_apart
+from metrpo.run.find import FoundRuns, SeenRun, find, is_finished, told_apart
+from metrpo.run.metrics import numbers
 
 SPARKS = "▁▂▃▄▅▆▇█"
 _WIDE = 170
@@ -145,7 +146,7 @@ def _is_alive(lock: Path) -> bool:
 
 def sparkline(values: Sequence[float | None], width: int = 12) -> str:
     """A history as at most `width` small bars, from its least to its largest value; a gap where there is none."""
-    whole = np.array([math.nan if v is None else v for v in values], dtype=float)
+    whole = numbers(values)
     parts = np.array_split(whole, min(width, len(whole)) or 1)
     shown = [float(np.mean(f)) if len(f := part[np.isfinite(part)]) else math.nan for part in parts]
     finite = [v for v in shown if math.isfinite(v)]
@@ -161,7 +162,7 @@ def standings_of(runs: Sequence[SeenRun]) -> list[Standing]:
     return [standing(run, changed=changed) for run, changed in zip(runs, told_apart(runs), strict=True)]
 
 
-def table(found: Found, console: Console) -> Group:
+def table(found: FoundRuns, console: Console) -> Group:
     """One line a run, running ones first, and below it what could not be read; columns as far as there is room."""
     order = ("running", "stopped", "finished")
     standings = sorted(standings_of(found.runs), key=lambda s: order.index(s.state))
