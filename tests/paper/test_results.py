@@ -12,7 +12,7 @@ from metrpo.paper.figures import FIGURES, runs_there
 from metrpo.paper.summary import as_markdown
 from metrpo.paper.summary import summarise as summarise_figure
 from metrpo.run.files import folder_name
-from metrpo.speed.measure import Report
+from metrpo.speed.measure import BenchReport
 from places import ROOT
 
 RUNS = sorted(path.parent for path in (ROOT / "results").glob("*/*/*/seed-*/metrics.csv"))
@@ -86,8 +86,8 @@ def test_a_figures_table_is_the_one_that_the_metrics_give(name):
 
 def test_the_performance_table_is_the_recorded_one():
     recorded = json.loads((ROOT / "results" / "performance" / "bench.json").read_text())
-    text = Report.of(recorded).text()
-    assert text in (ROOT / "docs" / "performance.md").read_text(), "paste what Report.of(bench.json).text() gives"
+    text = BenchReport.of(recorded).text()
+    assert text in (ROOT / "docs" / "performance.md").read_text(), "paste what BenchReport.of(bench.json).text() gives"
 
 
 def test_of_every_mutant_that_survived_it_is_said_why():
