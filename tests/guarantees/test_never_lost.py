@@ -270,7 +270,7 @@ def test_what_cannot_go_on_does_not_say_so(tmp_path, taught, monkeypatch, capsys
     assert main.main(["collect", str(run_dir), "--data", str(tmp_path / "none.npz")]) == 2
     err = capsys.readouterr().err
     assert "expected an environment, got none" in err
-    assert "expected an .npz of numbers" in err
+    assert "expected an .npz of states" in err
     assert "goes on" not in err
 
 

@@ -241,7 +241,7 @@ def test_fitting_stops_when_no_member_improves_within_patience(monkeypatch, impr
     config = FitConfig(**settings)
     trained = []
 
-    def scripted(at, normaliser, train, validation, config, mesh, key, steps, after):
+    def scripted(at, data, config, mesh, key, steps, after):
         trained.append((int(after), int(steps)))
         better = jnp.array([int(after) in list(script) for script in improvements])
         return at._replace(best_pass=jnp.where(better, after, at.best_pass), best_loss=at.best_loss - better)

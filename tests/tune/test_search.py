@@ -357,7 +357,7 @@ def test_ctrl_c_stops_the_runs_and_the_same_command_goes_on(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         tune(search(), tmp_path / "broken", 1, told.append, fake)
     assert fake.terminated == ["Swimmer/trial-001/seed-0"]
-    assert told[-1] == "stopping 1 trial after their iteration; once more stops them at once"
+    assert told[-1] == "stopping 1 trial at the end of an iteration; once more stops them at once"
     told.clear()
     assert outcome(tune(search(), tmp_path / "broken", 1, told.append, fake)) == expected
     assert told[0] == "1 of 8 trials are finished, 1 broken off"

@@ -18,7 +18,7 @@ from metrpo.errors import DivergedError, EpisodeError, TaskError
 from metrpo.policy import gaussian
 from metrpo.world import batch_episodes, collect
 from metrpo.world.registry import get_task
-from metrpo.world.tasks import rllab
+from metrpo.world.tasks.rllab.environment import MujocoTask
 
 NAMES = ["Swimmer", "Snake", "Hopper", "HopperUpright", "HalfCheetah", "Ant", "Humanoid", "HumanoidStandup"]
 
@@ -167,7 +167,7 @@ def test_what_is_not_a_number_is_named():
 
 
 def test_a_simulation_that_diverges_is_named(monkeypatch):
-    advance = rllab.MujocoTask.advance
+    advance = MujocoTask.advance
 
     def diverged(self, controls):
         state = advance(self, controls)
@@ -175,7 +175,7 @@ def test_a_simulation_that_diverges_is_named(monkeypatch):
             state[1] = np.inf
         return state
 
-    monkeypatch.setattr(rllab.MujocoTask, "advance", diverged)
+    monkeypatch.setattr(MujocoTask, "advance", diverged)
     act = lambda states, numbers, steps: np.where(steps[:, None] == 2, 1.0, 0.0) * np.ones((len(states), 2))  # noqa: E731
     with pytest.raises(EpisodeError, match=r"Swimmer: the simulation diverged \(at step 2 of an episode\)"):
         batch_episodes.play(get_task("Swimmer"), act, iter([0]))

@@ -161,7 +161,7 @@ def test_an_action_of_another_size_is_not_stretched(size):
 
 def test_a_number_is_an_action_of_one_number_and_nothing_is_none():
     assert real.evaluate(made(), lambda state: 0.5, 2, seed=0).tolist() == [5, 5]
-    with pytest.raises(TaskError, match="expected an action of 1 numbers, got None"):
+    with pytest.raises(TaskError, match="expected an action of 1 number, got None"):
         real.evaluate(made(), lambda state: None, 1, seed=0)
 
 
@@ -220,7 +220,7 @@ def test_an_observation_that_is_no_state_is_one_error(observation):
     with pytest.raises(TaskError, match=r"Mine: reset\(\): expected an observation of"):
         task_of(lambda **_: Other(), name="Mine", horizon=5)
     plain = Task("Mine", None, 1, 1, 5, None, make=lambda **_: Other())
-    with pytest.raises(TaskError, match=r"Mine: reset\(\): expected an observation of 1 numbers, got"):
+    with pytest.raises(TaskError, match=r"Mine: reset\(\): expected an observation of 1 number, got"):
         real.evaluate(plain, lambda state: np.zeros(1), 1, seed=0)
 
 

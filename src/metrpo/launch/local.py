@@ -64,7 +64,7 @@ def run_locally(runs: list[RunSpec], out: Path, means: Means, tell: Tell) -> lis
 def _stop(children: list[_Child], tell: Tell) -> None:
     """Ends the runs: asked once, each finishes its iteration; when this is interrupted, it asks them once more."""
     if children:
-        tell(f"stopping {counted(len(children), 'run')} after their iteration; once more stops them at once")
+        tell(f"stopping {counted(len(children), 'run')} at the end of an iteration; once more stops them at once")
     try:
         _ask_to_stop(children)
     except BaseException:

@@ -210,9 +210,8 @@ class _Tuning:
     def _stop_all(self) -> None:
         """Ends what is under way: each run finishes its iteration, and when this is interrupted is asked once more."""
         if self._going:
-            self._tell(
-                f"stopping {counted(len(self._going), 'trial')} after their iteration; once more stops them at once"
-            )
+            trials = counted(len(self._going), "trial")
+            self._tell(f"stopping {trials} at the end of an iteration; once more stops them at once")
         try:
             self._end_all()
         except BaseException:

@@ -153,7 +153,7 @@ def _finish(ray: Any, ref: Any, run: RunSpec, out: Path, count: str, tell: Tell)
 
 def _stop(ray: Any, refs: list[Any], heard: list[int], tell: Tell) -> None:
     """Ends the runs and raises `Stopped`: asked once, each finishes its iteration; asked once more, they are killed."""
-    tell("stopping the runs after their iteration; once more stops them at once")
+    tell("stopping the runs at the end of an iteration; once more stops them at once")
     for ref in refs:
         ray.cancel(ref, recursive=False)  # what it is sending to the store is to arrive
     while refs and len(heard) == 1:
