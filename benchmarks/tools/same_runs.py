@@ -25,10 +25,11 @@ import numpy as np
 SMALL = [
     *("--collect.steps", "400", "--fit.max-steps", "40", "--imagine.steps", "2000", "--validate.max-updates", "10"),
     *("--validate.starts", "10", "--evaluation-episodes", "2", "--iterations", "2", "--deterministic", "--no-video"),
+    *("--ensemble.hidden", "32", "32"),
 ]
 RUNS: dict[str, str] = {
     "Swimmer": "Swimmer",
-    "Swimmer-paper": "Swimmer --preset paper --ensemble.hidden 32 32",
+    "Swimmer-paper": "Swimmer --preset paper",
     "Pendulum-learned": "Pendulum-v1 --learn-reward",
     "mbbl-long-horizon": "mbbl/HalfCheetah --preset long-horizon",
     "curious": "Swimmer --imagine.disagreement 0.1",
