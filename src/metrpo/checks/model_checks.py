@@ -9,6 +9,7 @@ import numpy as np
 
 from metrpo.checks.finding import Concern, after, horizons, iteration_at, losses_of, short, since_when
 from metrpo.config import Config
+from metrpo.counting import counted
 from metrpo.run.metrics import Row, column
 
 EXPLOITED = 0.5
@@ -90,12 +91,11 @@ def unfit_dimensions(rows: Sequence[Row], config: Config) -> Concern | None:
     since = since_when(rows, dimensions > 0)
     if since is None:
         return None
-    number = int(dimensions[-1])
     return Concern(
         "unfit-dimensions",
         "warning",
         since,
-        f"{number} observed dimension{'s' if number > 1 else ''} of an offset or a scale that cannot be learned from",
+        f"{counted(int(dimensions[-1]), 'observed dimension')} of an offset or a scale that cannot be learned from",
         "float32, the bounds of imagination or the scales of policy and models hide how these change",
         "the first iteration of metrpo train names them and says what to do; give differences from something near, or "
         "another unit",

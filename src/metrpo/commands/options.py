@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from metrpo.config import Config, Preset, System
+from metrpo.config import Config, ImproverName, Method, Preset, System
 from metrpo.errors import ConfigError
 
 Switch = Annotated[bool, FlagCreatePairsOff]
@@ -29,10 +29,10 @@ class RunOptions(Config):
     """The method: me-trpo, or one to compare it with. trpo, ppo, ddpg, svg-1 and svg-inf learn without the ensemble:
     trpo, ppo and ddpg on real steps alone (ppo and ddpg are Stable-Baselines3's). Others, such as model-ppo and k-1,
     change a few settings of me-trpo."""
-    method: Annotated[Literal["model-based", "trpo", "ppo", "ddpg", "svg"], arg(metavar="NAME")] = "model-based"
+    method: Annotated[Method, arg(metavar="NAME")] = "model-based"
     """The loop, which --system chooses: model-based (the paper's), or a baseline: trpo, Stable-Baselines3's ppo and
     ddpg, svg."""
-    improver: Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic"] = "trpo"
+    improver: ImproverName = "trpo"
     """How the policy is improved on imagined steps: by score functions (trpo, ppo, vpg) or through the models
     (bptt). This ppo is ours, within the ensemble; --ppo.clip and the like are its settings."""
     iterations: int = 10

@@ -314,6 +314,12 @@ System = Literal[
 ]
 """Names of the systems that the paper compares."""
 
+Method = Literal["model-based", "trpo", "ppo", "ddpg", "svg"]
+"""The loops: in the ensemble, or a baseline in the real environment."""
+
+ImproverName = Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic"]
+"""The rows of `metrpo.policy.improvers.table.IMPROVERS`."""
+
 Preset = Literal["fast", "paper", "long-horizon"]
 """Names of the presets (see `metrpo.presets`)."""
 
@@ -337,10 +343,10 @@ class Config:
     """An .npz of logged transitions to start from (see `metrpo.world.offline_data`)."""
     system: System = "me-trpo"
     """Which of the paper's systems the values describe (see `metrpo.systems`); a label, the values themselves count."""
-    method: Literal["model-based", "trpo", "ppo", "ddpg", "svg"] = "model-based"
+    method: Method = "model-based"
     """The loop: in the ensemble (the paper's Algorithms 1 and 2), or a baseline in the real environment: TRPO,
     Stable-Baselines3's PPO and DDPG, stochastic value gradients."""
-    improver: Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic"] = "trpo"
+    improver: ImproverName = "trpo"
     """How the policy is improved on imagined steps: by the score function (trpo, ppo, vpg) or by backpropagation
     through the models, of the mean action or of reparametrised samples. This ppo is ours; the system ppo is another."""
     learn_reward: bool = False

@@ -35,11 +35,10 @@ def standing(run: RunSpec, rows: Sequence[Row]) -> str:
     """How far the run has got."""
     if not rows:
         return "in its first iteration"
-    last, budget, config = rows[-1], "", run.config
-    if config.real_steps:
-        budget = f" of {config.real_steps:,}"
-    of = "" if config.real_steps else f"/{config.iterations}"
-    return f"iteration {last['iteration']}{of}, {last['real_steps']:,}{budget} real steps, {earned(last)}"
+    last, config = rows[-1], run.config
+    of_steps = f" of {config.real_steps:,}" if config.real_steps else ""
+    of_iterations = "" if config.real_steps else f"/{config.iterations}"
+    return f"iteration {last['iteration']}{of_iterations}, {last['real_steps']:,}{of_steps} real steps, {earned(last)}"
 
 
 def words(run: RunSpec, directory: Path) -> list[str]:

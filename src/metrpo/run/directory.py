@@ -8,8 +8,7 @@
     DIR/episodes/      real episodes that the state has not learned from (see `metrpo.run.episodes`)
 
 The newest checkpoint is the run: it holds the state and all rows. Everything else is derived from it, written after it
-and what is missing or old again when the run is resumed, so that a kill at any moment leaves nothing twice and nothing
-missing.
+and again when the run is resumed, so that a kill at any moment leaves nothing twice and nothing missing.
 """
 
 from __future__ import annotations
@@ -217,9 +216,7 @@ class RunDirectory:
 
     def _write_config(self) -> None:
         # The budget may be another one than last time.
-        file, text = self.path / "config.json", configs.to_json(self.config)
-        if not _holds(file, text):
-            atomic_write(file, text)
+        atomic_write(self.path / "config.json", configs.to_json(self.config))
 
     def _publish(self, state: Saved) -> None:
         # All of it at every start, too: nothing says whether a picture or an event file is damaged.
@@ -261,9 +258,6 @@ class RunDirectory:
             _within(_PATIENCE, write)
         except Exception as error:
             self._failed.add(what)
-            if self._events is not None and "events" in what.lower():  # torn: written anew with the next start
-                with contextlib.suppress(OSError):
-                    self._events.path.unlink()
             _log.warning("no %s from here on (%s: %s); training goes on", what, type(error).__name__, error)
 
 
@@ -284,12 +278,6 @@ def _within(seconds: float, act: Callable[[], None]) -> None:
         raise TimeoutError(f"not finished within {seconds:g} s")
     if raised:
         raise raised[0]
-
-
-def _holds(file: Path, text: str) -> bool:
-    with contextlib.suppress(OSError, UnicodeDecodeError):
-        return file.read_text() == text
-    return False
 
 
 def _number(path: Path) -> int:

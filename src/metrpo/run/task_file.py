@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-from metrpo.errors import ConfigError, MissingTaskError, RunDirectoryError
-from metrpo.run.files import atomic_write
-from metrpo.safe_load import json_of, text_of
+from metrpo.errors import ConfigError, MissingTaskError
+from metrpo.run.about import about, note
 from metrpo.world import resolve
 from metrpo.world.registry import get_task
 from metrpo.world.task import Task
@@ -17,11 +15,8 @@ _FILE, _FOLDER = "task_file", "task_folder"
 
 def remember(run_dir: str | Path, task: str) -> None:
     """Notes in `run.json` where the file of the task `task` lies now, or its module's folder, if it is named by one."""
-    about = _about(run_dir)
     places = {_FILE: resolve.file_of(task), _FOLDER: resolve.folder_of(task)}
-    noted = {field: str(place) for field, place in places.items() if place is not None}
-    if about | noted != about:
-        atomic_write(Path(run_dir) / "run.json", json.dumps(about | noted, indent=2) + "\n")
+    note(run_dir, {field: str(place) for field, place in places.items() if place is not None})
 
 
 def task_of_run(run_dir: str | Path, task: str) -> Task:
@@ -30,8 +25,8 @@ def task_of_run(run_dir: str | Path, task: str) -> Task:
 
     From then on the name means that task in this process. Raises `TaskError` when there is none.
     """
-    about, file = _about(run_dir), resolve.file_of(task)
-    lay, folder = about.get(_FILE), about.get(_FOLDER)
+    noted, file = about(run_dir), resolve.file_of(task)
+    lay, folder = noted.get(_FILE), noted.get(_FOLDER)
     if file is not None and isinstance(lay, str) and Path(lay).name == file.name and Path(lay).is_file():
         return resolve.place(task, get_task(f"{lay}:{task.rpartition(':')[2]}"))
     if isinstance(folder, str) and resolve.is_in(Path(folder), task):
@@ -52,11 +47,3 @@ def moved(task: str, where: str) -> Task:
     if ":" not in task:
         raise ConfigError(f"task: expected it for a run whose task lies in a file or module, got {where} for {task}")
     return resolve.place(task, get_task(where))
-
-
-def _about(run_dir: str | Path) -> dict[str, object]:
-    file = Path(run_dir) / "run.json"
-    if not file.is_file():  # a policy by itself
-        return {}
-    about = json_of(text_of(file, RunDirectoryError), f"{file} is damaged", RunDirectoryError)
-    return about if isinstance(about, dict) else {}
