@@ -31,13 +31,13 @@ def mutants(source: str) -> Iterator[dict[str, str]]:
             first = next(n for n, (a, b) in enumerate(zip(old, new, strict=False)) if a != b)
             same = next(n for n, (a, b) in enumerate(zip(reversed(old), reversed(new), strict=False)) if a != b)
             before, after = (" ".join(x.strip() for x in lines[first : len(lines) - same]) for lines in (old, new))
-            digest = hashlib.sha256(text.encode()).hexdigest()[:12]
+            digest = hashlib.sha256(what.encode()).hexdigest()[:12]
             cells = (digest, str(first + 1), name.removeprefix("core/"), before, after)
             yield dict(zip(FIELDS, cells, strict=False)) | {"text": text}
 
 
 def meaning(text: str) -> str | None:
-    """What a module does, as text: its syntax tree without annotations; None where it has none."""
+    """What a module does, as text: its syntax tree without annotations and docstrings; None where it has none."""
     try:
         tree = ast.parse(text)
     except SyntaxError:
@@ -47,4 +47,6 @@ def meaning(text: str) -> str | None:
             node.annotation = ast.Constant(None)
         elif isinstance(node, ast.FunctionDef):
             node.returns = None
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            node.body = node.body[1:] or [ast.Pass()]
     return ast.dump(tree)

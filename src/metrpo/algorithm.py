@@ -8,12 +8,15 @@
             improve   the policy on them, by TRPO                               policy/improvers/
             validate  the policy in each model                                  policy/stopping.py
         until the models no longer agree that it improves
+        prove     it in a few real episodes, go back if it earns less           stages/proven.py
     until the budget is spent
 
 `step` is one turn of the outer loop and reads like it; `metrpo.training` repeats it until the budget is spent.
 """
 
 from __future__ import annotations
+
+from functools import partial
 
 import jax
 
@@ -28,10 +31,12 @@ from metrpo.policy.value.table import init_baseline
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.stages.ensemble_fit import fit_ensemble, fresh_networks
+from metrpo.stages.log import Log, Unkept, left_out
 from metrpo.stages.policy_search import improve_policy
-from metrpo.stages.real_steps import Log, Unkept, collect, left_out
-from metrpo.stages.records import Done, record
-from metrpo.stages.state import Row, State, inputs_for
+from metrpo.stages.proven import prove, settle
+from metrpo.stages.real_steps import collect
+from metrpo.stages.records import NOTHING, Done, Real, record
+from metrpo.stages.state import Proven, Row, State, inputs_for
 from metrpo.types import Episode
 from metrpo.world import dataset as datasets
 from metrpo.world import offline_data
@@ -65,6 +70,7 @@ def init(config: Config, task: Task) -> State:
         networks=fresh_networks(config, task, ensemble_key),
         baseline=init_baseline(config.advantage, task.state_size, key_of(config.seed, 0, Stage.IMPROVE)),
         dataset=_logged(config, task),
+        proven=Proven(policy, 0.0, 0.0, 0),
     )
 
 
@@ -75,7 +81,8 @@ def step(
     clock, log = Clock(), log or Unkept()
     with clock("collect"):
         episodes = collect(config, task, state, progress, log)
-    return learn(config, task, state, episodes, progress, clock, left_out(log))
+    real = Real(left_out(log), partial(prove, config, task, state, progress, log))
+    return learn(config, task, state, episodes, progress, clock, real)
 
 
 def learn(
@@ -85,9 +92,9 @@ def learn(
     episodes: list[Episode],
     progress: Progress = SILENT,
     clock: Clock | None = None,
-    failed: int = 0,
+    real: Real = NOTHING,
 ) -> tuple[State, Row]:
-    """The rest of an outer iteration: what `episodes`, and all before them, teach; `failed` others were left out.
+    """The rest of an outer iteration: what `episodes`, and all before them, teach.
 
     What only records (diagnostics, evaluation) cannot fail: it is NaN then, with a warning.
 
@@ -114,7 +121,7 @@ def learn(
         )
         advice = "the run was resumed from, or became, a state that cannot go on: use smaller steps or start anew"
         require_finite("improve", iteration, advice, policy=policy, baseline=baseline)
-    following = State(
+    candidate = State(
         iteration=iteration,
         real_steps=state.real_steps + sum(len(e.rewards) for e in episodes),
         policy=policy,
@@ -122,10 +129,13 @@ def learn(
         networks=ensemble.networks,
         baseline=baseline,
         dataset=dataset,
+        proven=state.proven,
     )
+    with clock("collect"):
+        following, verdict = settle(config, task, state, candidate, real.prove(candidate))
     with clock("evaluate"):
         progress.stage("evaluate", config.evaluation_episodes)
-        row = record(config, task, following, Done(episodes, failed, ensemble, fitted, improved))
+        row = record(config, task, following, Done(episodes, real.failed, ensemble, fitted, improved, verdict))
     return following, row | clock.row()
 
 

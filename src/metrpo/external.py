@@ -24,6 +24,7 @@ from metrpo.run import task_file
 from metrpo.run.directory import RunDirectory, stored_config
 from metrpo.run.memory import require_memory
 from metrpo.run.metrics import Row
+from metrpo.stages.records import Real
 from metrpo.training import check
 from metrpo.types import Episode
 from metrpo.world import offline_data
@@ -105,8 +106,8 @@ def improve(run_dir: str | Path, progress: Progress = SILENT, task: str | None =
             )
         progress.begin(state.iteration + 1, None)
         try:
-            failed = algorithm.left_out(run.episodes)
-            written = run.save(*algorithm.learn(config, known, state, episodes, progress, None, failed))
+            real = Real(algorithm.left_out(run.episodes))  # none to prove the policy: who plays is another program
+            written = run.save(*algorithm.learn(config, known, state, episodes, progress, None, real))
             progress.end(written, None)
         finally:
             progress.close()

@@ -51,6 +51,7 @@ FAST_ALL: Overrides = {
     "policy.min_std": 0.2,
     "policy.normalise": True,
     "validate.max_updates": 100,
+    "validate.real_episodes": 4,
     "validate.starts": 50,
 }
 

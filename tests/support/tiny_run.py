@@ -88,8 +88,8 @@ def cheap():
             begun[config.iterations] = init(config, task)
         return begun[config.iterations]
 
-    def counted_append(self, episode):
-        path = append(self, episode)
+    def counted_append(self, episode, proof=False):
+        path = append(self, episode, proof)
         Counted.kept += 1
         return path
 

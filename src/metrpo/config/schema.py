@@ -280,10 +280,15 @@ class ValidateConfig:
     """Most policy updates in one outer iteration."""
     starts: int = 500
     """Fixed start states from which every model evaluates the policy, deterministic, over the full horizon."""
+    real_episodes: int = 0
+    """Real episodes of an iteration that try its new policy, without noise; one that earns clearly less than the best is
+    given up. 0, or so many that they take more than a quarter of `collect.steps`: none."""
 
     def __post_init__(self) -> None:
         for name in ("every", "patience", "max_updates", "starts"):
             require(getattr(self, name) >= 1, f"validate.{name}", getattr(self, name), "at least 1")
+        tries = self.real_episodes
+        require(tries == 0 or tries >= 2, "validate.real_episodes", tries, "0, or at least 2")
         require(0 <= self.threshold <= 1, "validate.threshold", self.threshold, "between 0 and 1")
 
 

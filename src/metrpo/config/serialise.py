@@ -28,6 +28,7 @@ ADDED = (
     "config.advantage.value_batch_size",
     "config.advantage.value_learning_rate",
     "config.trpo.fisher_every",
+    "config.validate.real_episodes",
     "config.system",
     "config.method",
     "config.gradient",

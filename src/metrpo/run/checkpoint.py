@@ -15,8 +15,9 @@ from metrpo.run.files import metrpo_version, read_arrays, write_arrays
 from metrpo.safe_load import brief
 
 Tree = TypeVar("Tree")
-_LATER = frozenset({".dataset.origin"})
-"""Leaves that files of earlier versions lack: the template's stand in. Their shapes are the template's, always."""
+_LATER = (".dataset.origin", ".proven")
+"""Leaves, or what holds them, that files of earlier versions lack: the template's stand in. Their shapes are the
+template's, always."""
 
 
 def save_state(path: Path, state: Any, meta: Mapping[str, Any]) -> None:
@@ -40,7 +41,7 @@ def load_state(path: Path, template: Tree) -> tuple[Tree, dict[str, Any]]:
     """
     arrays, meta = read_arrays(path)
     expected = dict(_named_leaves(template))
-    arrays = {n: np.asarray(leaf) for n, leaf in expected.items() if n in _LATER} | arrays
+    arrays = {n: np.asarray(leaf) for n, leaf in expected.items() if n.startswith(_LATER)} | arrays
     wrong = [f"lacks {n}" for n in expected if n not in arrays]
     wrong += [f"has unknown {n}" for n in arrays if n not in expected]
     wrong += [w for n, leaf in expected.items() if n in arrays and (w := _mismatch(n, leaf, arrays[n]))]
@@ -77,7 +78,7 @@ def _mismatch(name: str, leaf: Any, array: np.ndarray) -> str:
     kind, rank = _kind(leaf)
     if (kind, rank) != (array.dtype, array.ndim):
         return f"has {name} as {array.dtype} of rank {array.ndim} instead of {kind} of rank {rank}"
-    grows = isinstance(leaf, np.ndarray) and name not in _LATER
+    grows = isinstance(leaf, np.ndarray) and not name.startswith(_LATER)
     expected = np.shape(leaf)
     if expected[grows:] != array.shape[grows:]:
         return f"has {name} of shape {list(array.shape)} instead of {['n', *expected[1:]] if grows else list(expected)}"

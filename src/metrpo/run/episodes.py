@@ -74,7 +74,7 @@ class EpisodeLog:
         return {after: each for after, each in found.items() if all(type(x) is bool for x in each.values())}
 
     def pending(self) -> list[Episode]:
-        """The episodes that the state has not learned from, in order.
+        """The episodes that the state has not learned from, in order, but for `proofs`.
 
         Raises `DamagedFile` when one is not as it was written, `RunDirectoryError` when one cannot be read.
         """
@@ -83,14 +83,22 @@ class EpisodeLog:
         if lost := self.read - self.taken - len(numbers):
             span = f"{self.taken:08d} and {self.read - 1:08d}"
             _log.warning("%s: %d real episodes between %s are gone; going on without them", self.folder, lost, span)
-        return [self._load(n) for n in numbers]
+        return [episode for episode, proof in map(self._load, numbers) if not proof]
+
+    def proofs(self) -> list[Episode]:
+        """Those of the episodes that wait which tried a policy that the state does not hold yet.
+
+        Raises as `pending`.
+        """
+        waiting = (self._load(n) for n in self._numbers() if n >= self.taken)
+        return [episode for episode, proof in waiting if proof]
 
     def waiting_steps(self) -> int:
         """Real steps that the state has not learned from, as far as their files say."""
         paths = [self._path(n) for n in self._numbers() if n >= self.taken]
         return sum(_steps_in(path, path.stat().st_mtime_ns) for path in paths)
 
-    def append(self, episode: Episode) -> Path:
+    def append(self, episode: Episode, proof: bool = False) -> Path:
         """Puts an episode on disk, whole or not at all, under the next free number; others may append meanwhile.
 
         Raises `RunDirectoryError` when it cannot be written.
@@ -102,7 +110,7 @@ class EpisodeLog:
         try:
             with writing(self._path(number)):
                 while True:
-                    write_arrays(mine, arrays, {"number": number})
+                    write_arrays(mine, arrays, {"number": number, "proof": proof})
                     try:
                         os.link(mine, self._path(number))  # unlike a rename, it never replaces another's episode
                         break
@@ -130,7 +138,8 @@ class EpisodeLog:
     def _path(self, number: int) -> Path:
         return self.folder / f"{number:08d}.npz"
 
-    def _load(self, number: int) -> Episode:
+    def _load(self, number: int) -> tuple[Episode, bool]:
+        """An episode, and whether it is a proof."""
         path = self._path(number)
         arrays, meta = read_arrays(path)
         # Under another's number, it would be learned from twice, and the other one lost.
@@ -140,7 +149,7 @@ class EpisodeLog:
                 "over its arrays with metrpo.append_episode"
             )
         try:
-            return self._checked(arrays)
+            return self._checked(arrays), meta.get("proof") is True
         except ValueError as error:
             raise RunDirectoryError(f"{path} holds no episode of this run ({error}); move it away to go on") from None
 

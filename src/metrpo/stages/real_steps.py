@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
-from typing import Protocol
 
 import jax
 import numpy as np
@@ -21,54 +20,13 @@ from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.inputs import Inputs, folded, unfolded
 from metrpo.seeds import Stage, rng_of
+from metrpo.stages.log import Log, Unkept, left_out
+from metrpo.stages.proven import steps_kept_for_proof
 from metrpo.stages.state import State, inputs_for, on_host
 from metrpo.types import Episode
 from metrpo.world import collect as real
 from metrpo.world.origin import of_real
 from metrpo.world.task import Task
-
-
-class Log(Protocol):
-    """Where real episodes go as they end, and where those wait that nobody has learned from yet."""
-
-    def pending(self) -> list[Episode]:
-        """The episodes that wait."""
-
-    def append(self, episode: Episode) -> object:
-        """Keeps one more."""
-
-    def failures(self) -> Mapping[int, bool]:
-        """The episodes of this iteration in which the environment failed, and whether each is left out for good."""
-
-    def note_failures(self, failures: Mapping[int, bool]) -> None:
-        """Keeps them."""
-
-
-class Unkept:
-    """A log of nothing but the failures of one iteration."""
-
-    def __init__(self) -> None:
-        self._failures: Mapping[int, bool] = {}
-
-    def pending(self) -> list[Episode]:
-        """None."""
-        return []
-
-    def append(self, episode: Episode) -> None:
-        """Forgotten."""
-
-    def failures(self) -> Mapping[int, bool]:
-        """The last ones noted."""
-        return self._failures
-
-    def note_failures(self, failures: Mapping[int, bool]) -> None:
-        """Remembered."""
-        self._failures = dict(failures)
-
-
-def left_out(log: Log) -> int:
-    """Episodes of this iteration that are played no more, for the environment failed in them."""
-    return sum(log.failures().values())
 
 
 def collect(
@@ -81,7 +39,8 @@ def collect(
 ) -> list[Episode]:
     """The real episodes of the next iteration: those that wait in `log`, and more until they have enough steps.
 
-    Enough are `at_least`, or as many as the config asks for and its budget allows; an episode of more steps than the
+    Enough are `at_least`, or as many as the config asks for and its budget allows, less those that are kept for trying
+    the next policy (`stages.proven`); an episode of more steps than the
     config asks for is cut there, and so is the one that reaches the end of the budget. New ones go to `log` as they
     end; what a run that was stopped has collected is not collected again.
 
@@ -89,8 +48,9 @@ def collect(
     So is one that fails otherwise, but in its second try: the first ends the run. Raises `UnplayableError` when too
     many are left out, `EpisodeError` for another failure.
     """
-    enough = budget.steps_wanted(config, state.real_steps) if at_least is None else at_least
-    at_most = budget.steps_left(config, state.real_steps) if at_least is None else math.inf
+    kept = steps_kept_for_proof(config, task, state.real_steps)
+    enough = budget.steps_wanted(config, state.real_steps) - kept if at_least is None else at_least
+    at_most = budget.steps_left(config, state.real_steps) - kept if at_least is None else math.inf
     progress.stage("collect", enough)
     log = log or Unkept()
     episodes = log.pending()

@@ -22,6 +22,7 @@ from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.policy_phase import PhaseInfo, imagined_horizon
 from metrpo.seeds import Stage, key_of, rng_of
+from metrpo.stages.proven import Verdict
 from metrpo.stages.state import Row, State, on_host
 from metrpo.types import Episode
 from metrpo.world import batch_episodes
@@ -37,6 +38,18 @@ EVALUATION_STEPS = 200_000
 T = TypeVar("T")
 
 
+class Real(NamedTuple):
+    """What an iteration has of the real environment besides the episodes that it learns from."""
+
+    failed: int = 0
+    """Episodes left out because the environment failed in them."""
+    prove: Callable[[State], list[Episode]] = lambda candidate: []
+    """Real episodes that try the candidate's policy (`stages.proven`)."""
+
+
+NOTHING = Real()
+
+
 class Done(NamedTuple):
     """What the stages of one iteration did."""
 
@@ -46,6 +59,7 @@ class Done(NamedTuple):
     ensemble: Ensemble
     fitted: FitInfo
     improved: PhaseInfo
+    verdict: Verdict
 
 
 def recorded(what: str, iteration: int, record: Callable[[], T], failed: T) -> T:
@@ -150,6 +164,8 @@ def _outcome(state: State, returns: np.ndarray, done: Done, cut: bool) -> Row:
         "return_real_std": float(np.std(returns)),
         "return_collected": collected,
         "return_imagined": imagined,
+        "return_proof": done.verdict.mean,
+        "given_up": int(done.verdict.given_up),
         # What episodes of different lengths earn cannot be compared.
         "gap": math.nan if cut else imagined - float(np.mean(returns)),
         **{f"validation_loss_{k}": float(loss) for k, loss in enumerate(losses)},

@@ -19,6 +19,18 @@ Row = dict[str, float | int]
 """One iteration's metrics, in the order of metrics.csv's columns."""
 
 
+class Proven(NamedTuple):
+    """The best policy so far, by real episodes without noise."""
+
+    policy: Policy
+    mean: float
+    """Of their returns."""
+    error: float
+    """Standard error of the mean."""
+    episodes: int
+    """0: none has been played."""
+
+
 class State(NamedTuple):
     """Everything that an iteration hands to the next: a pytree whose structure the config fixes."""
 
@@ -33,6 +45,7 @@ class State(NamedTuple):
     """Of the ensemble; its normaliser derives from the dataset."""
     baseline: Baseline
     dataset: Dataset
+    proven: Proven
 
     @property
     def origin(self) -> np.ndarray:
