@@ -281,8 +281,8 @@ class ValidateConfig:
     starts: int = 500
     """Fixed start states from which every model evaluates the policy, deterministic, over the full horizon."""
     real_episodes: int = 0
-    """Real episodes of an iteration that try its new policy, without noise; one that earns clearly less than the best is
-    given up. 0, or so many that they take more than a quarter of `collect.steps`: none."""
+    """Real episodes of an iteration that try its new policy, without noise; one that earns clearly less than the best
+    is given up. 0, or so many that they take more than a quarter of `collect.steps`: none."""
 
     def __post_init__(self) -> None:
         for name in ("every", "patience", "max_updates", "starts"):
