@@ -101,6 +101,7 @@ OURS = {
     "policy.normalise": (False, "code: the policy sees the full, unnormalised state"),
     "policy.min_std": (0.0, "A.1.3: the std is reset at every phase (code)"),
     "policy.mean_penalty": (0.0, "the paper knows none: off"),
+    "validate.real_episodes": (0, "the paper validates in the models only"),
     "imagine.disagreement": (0.0, "the paper's future work: off"),
     "trust_reward": (False, "the paper's tasks are our own"),
     "learn_reward": (False, "section 2: the reward function is known"),

@@ -29,7 +29,10 @@ KINDS = {
 def strategy(kind):
     if dataclasses.is_dataclass(kind):
         hints = typing.get_type_hints(kind)
-        return st.builds(kind, **{f.name: strategy(hints[f.name]) for f in dataclasses.fields(kind)})
+        fields = {f.name: strategy(hints[f.name]) for f in dataclasses.fields(kind)}
+        if "real_episodes" in fields:
+            fields["real_episodes"] = fields["real_episodes"].filter(lambda n: n > 1)
+        return st.builds(kind, **fields)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Literal:
         return st.sampled_from(arguments)
@@ -121,6 +124,7 @@ IMPOSSIBLE = {
     "policy.initial_std": [0.0, -1.0, float("nan")],
     "policy.min_std": [-0.1, float("inf"), float("nan")],
     "policy.mean_penalty": [-0.1, float("inf"), float("nan")],
+    "validate.real_episodes": [-1, 1],
     "advantage.discount": [-0.1, 1.1, float("nan")],
     "advantage.gae_lambda": [-0.1, 1.1, float("nan")],
     "advantage.ridge": [0.0, -1.0],

@@ -16,7 +16,7 @@ import tiny_run
 from helpers import random_policy
 from metrpo import algorithm, training
 from metrpo.config import Config
-from metrpo.errors import ConfigError, EpisodeError
+from metrpo.errors import EpisodeError
 from metrpo.policy import gaussian
 from metrpo.presets import override, preset
 from metrpo.run import directory, machine
@@ -217,8 +217,3 @@ def test_proofs_take_a_quarter_of_an_iteration_at_most(wanted, tries, left, kept
 def test_long_episodes_are_too_dear_for_proofs():
     assert steps_kept_for_proof(preset("HalfCheetah"), probe.PROBE, 0) > 0
     assert steps_kept_for_proof(preset("HalfCheetah"), dataclasses.replace(probe.PROBE, horizon=1000), 0) == 0
-
-
-def test_one_proof_is_refused():
-    with pytest.raises(ConfigError, match=r"validate.real_episodes.*at least 2, got 1"):
-        override(Config(task="Probe"), {"validate.real_episodes": 1})

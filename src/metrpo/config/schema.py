@@ -141,7 +141,8 @@ class PolicyConfig:
     """Above 0: the standard deviation goes on from phase to phase and is at least this where one starts; 0: every phase
     starts from initial_std (the paper)."""
     mean_penalty: float = 0.0
-    """Taken from the surrogate of trpo, ppo and vpg: this times the squared excess of mean actions beyond 0.9."""
+    """Taken from the surrogate of trpo, ppo and vpg: this times the squared excess of mean actions beyond 0.9, over the
+    standard deviation."""
 
     def __post_init__(self) -> None:
         require(all(n >= 1 for n in self.hidden), "policy.hidden", self.hidden, "sizes of at least 1")

@@ -70,6 +70,15 @@ def excess(means: Array) -> Array:
     return means - jnp.clip(means, -LIMIT, LIMIT)
 
 
+def saturation(means: Array, log_std: Array) -> Array:
+    """What saturated mean actions cost, each of them: the squared excess beyond `LIMIT`, over the standard deviation.
+
+    The surrogate's slope in the mean grows as 1 / std, too: else what a narrow policy gains would outweigh any cost.
+    The cost has no slope in the standard deviation.
+    """
+    return jnp.square(excess(means)) * jnp.exp(-jax.lax.stop_gradient(log_std))
+
+
 def reset_std(policy: Policy, initial_std: float) -> Policy:
     """The policy with its standard deviation set back, as at the start of every policy phase."""
     return policy._replace(log_std=jnp.full(policy.log_std.shape, math.log(initial_std), jnp.float32))

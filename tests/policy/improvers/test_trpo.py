@@ -148,11 +148,11 @@ def test_the_step_is_the_natural_gradient_of_length_max_kl():
     np.testing.assert_allclose(step, full * 0.8 ** int(info.backtracks), atol=2e-3 * np.abs(full).max())
 
 
-def slow_penalty(policy, batch):
-    """The squared excess of mean actions beyond 0.9, summed over actions, mean over the steps that count."""
+def slow_penalty(policy, batch, std):
+    """The squared excess of mean actions beyond 0.9 over the std, summed over actions, mean over the steps that count."""
     states = batch.states[batch.mask > 0]
     means = np.array([slow_mean(policy, s) for s in states])
-    return np.mean(np.sum(np.maximum(np.abs(means) - 0.9, 0) ** 2, axis=1))
+    return np.mean(np.sum(np.maximum(np.abs(means) - 0.9, 0) ** 2 / std, axis=1))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -160,8 +160,11 @@ def test_the_penalty_is_taken_from_the_surrogate(seed):
     policy = random_policy(seed, hidden=(5,), scale=4.0)
     batch = a_batch(seed + 1, policy)
     new, info = improve(policy, batch, CONFIG, penalty=0.5)
-    before, after = (slow_surrogate_and_kl(policy, p, batch)[0] - 0.5 * slow_penalty(p, batch) for p in (policy, new))
-    assert slow_penalty(policy, batch) > 0.1, "the case must be one that pays"
+    std = np.exp(policy.log_std)  # of the policy that acted, in both
+    before, after = (
+        slow_surrogate_and_kl(policy, p, batch)[0] - 0.5 * slow_penalty(p, batch, std) for p in (policy, new)
+    )
+    assert slow_penalty(policy, batch, std) > 0.1, "the case must be one that pays"
     assert info.accepted
     assert after - before == pytest.approx(float(info.improvement), rel=0.02, abs=2e-4)
 

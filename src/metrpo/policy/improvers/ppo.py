@@ -22,11 +22,11 @@ def clipped_surrogate(
 ) -> Array:
     """sum of min(ratio A, clip(ratio, 1 - clip, 1 + clip) A) over the steps of `batch` (their equation 7).
 
-    Less `penalty` times the squared excess of mean actions beyond 0.9.
+    Less `penalty` times what saturated mean actions cost (`gaussian.saturation`).
     """
     means = gaussian.mean(policy, batch.states)
     log_probability = gaussian.log_probability(means, policy.log_std, batch.actions)
-    cost = penalty * jnp.sum(jnp.square(gaussian.excess(means)), axis=-1) if penalty else 0.0
+    cost = penalty * jnp.sum(gaussian.saturation(means, policy.log_std), axis=-1) if penalty else 0.0
     ratio = jnp.exp(log_probability - old_log_probability)
     clipped = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
     return jnp.sum(batch.mask * (jnp.minimum(ratio * batch.advantages, clipped * batch.advantages) - cost))

@@ -21,8 +21,8 @@ from metrpo.types import Array
 def improve(policy: Policy, batch: Batch, config: TRPOConfig, penalty: float = 0.0) -> tuple[Policy, ImproveInfo]:
     """One TRPO update on `batch`; the policy stays as it is when no step of the line search improves within max_kl.
 
-    The surrogate loses `penalty` times the squared excess of mean actions beyond 0.9: clipped actions have no
-    gradient that could bring them back.
+    The surrogate loses `penalty` times what saturated mean actions cost (`gaussian.saturation`): clipped actions have
+    no gradient that could bring them back.
     """
     states, actions, advantages, mask = (chunked(x) for x in batch)
     count = jnp.maximum(across(jnp.sum(mask)), 1.0)
@@ -31,7 +31,7 @@ def improve(policy: Policy, batch: Batch, config: TRPOConfig, penalty: float = 0
     at = linearise(policy.layers, states)
 
     def cost(means: Array, mask: Array) -> Array:
-        return penalty / count * jnp.sum(mask * jnp.square(gaussian.excess(means))) if penalty else jnp.float32(0)
+        return penalty / count * jnp.sum(mask * gaussian.saturation(means, old_log_std)) if penalty else jnp.float32(0)
 
     def surrogate_and_kl(new: Policy) -> tuple[Array, Array]:
         log_std = new.log_std[:, None]
@@ -54,7 +54,7 @@ def improve(policy: Policy, batch: Batch, config: TRPOConfig, penalty: float = 0
     z = (actions - at.means) * jnp.exp(-old_log_std)
     rising = weights * z * jnp.exp(-old_log_std)
     if penalty:
-        rising = rising - 2 * penalty / count * mask * gaussian.excess(at.means)
+        rising = rising - 2 * penalty / count * mask * gaussian.excess(at.means) * jnp.exp(-old_log_std)
     slope = Policy(pull_back(at, rising), jnp.sum(weights * (jnp.square(z) - 1.0), axis=(0, 2)))
     flat, unravel = ravel_pytree(policy)
     gradient = ravel_pytree(across(slope))[0]

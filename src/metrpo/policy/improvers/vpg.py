@@ -19,11 +19,11 @@ from metrpo.types import Array
 def objective(policy: Policy, batch: Batch, count: Array, penalty: float = 0.0) -> Array:
     """sum of advantage x log pi(a | s), over `count`: its gradient at the policy that acted is the policy gradient.
 
-    Less `penalty` times the squared excess of mean actions beyond 0.9.
+    Less `penalty` times what saturated mean actions cost (`gaussian.saturation`).
     """
     means = gaussian.mean(policy, batch.states)
     gain = batch.advantages * gaussian.log_probability(means, policy.log_std, batch.actions)
-    cost = penalty * jnp.sum(jnp.square(gaussian.excess(means)), axis=-1) if penalty else 0.0
+    cost = penalty * jnp.sum(gaussian.saturation(means, policy.log_std), axis=-1) if penalty else 0.0
     return jnp.sum(batch.mask * (gain - cost)) / count
 
 
