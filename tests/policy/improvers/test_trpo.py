@@ -149,7 +149,7 @@ def test_the_step_is_the_natural_gradient_of_length_max_kl():
 
 
 def slow_penalty(policy, batch, std):
-    """The squared excess of mean actions beyond 0.9 over the std, summed over actions, mean over the steps that count."""
+    """The squared excess of mean actions beyond 0.9 over the std, summed over actions: its mean over the steps."""
     states = batch.states[batch.mask > 0]
     means = np.array([slow_mean(policy, s) for s in states])
     return np.mean(np.sum(np.maximum(np.abs(means) - 0.9, 0) ** 2 / std, axis=1))
