@@ -31,7 +31,8 @@ DERIVED = ("metrics.csv", "policy.npz", "config.json", "checkpoints/iteration-00
 
 def environment(cache):
     path = os.pathsep.join([str(SUPPORT), *sys.path])
-    return os.environ | {"PYTHONPATH": path, "XDG_CACHE_HOME": str(cache), "MUJOCO_GL": "disabled"}
+    inherited = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    return inherited | {"PYTHONPATH": path, "XDG_CACHE_HOME": str(cache), "MUJOCO_GL": "disabled"}
 
 
 def metrpo(cache, *arguments):

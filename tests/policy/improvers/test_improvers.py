@@ -353,7 +353,9 @@ def test_exploding_rollouts_and_a_model_of_nan_move_nothing():
 @pytest.mark.parametrize("name", list(IMPROVERS))
 def test_every_improver_comes_close_to_the_optimum_of_the_probe(name):
     """60 updates in the true dynamics come within a fifth of the Riccati return, from 25 times that loss."""
-    settings = {"imagine.steps": 600, "trpo.max_kl": 0.03, "gradient.learning_rate": 0.03, "ppo.minibatches": 4}
+    # 16 steps of PPO an update: at the others' rate rounding alone decides whether they overshoot.
+    rate = 0.01 if name == "ppo" else 0.03
+    settings = {"imagine.steps": 600, "trpo.max_kl": 0.03, "gradient.learning_rate": rate, "ppo.minibatches": 4}
     config = override(Config(task="Probe", improver=name), {**settings, "ppo.epochs": 4})
     ensemble = linear_ensemble([(probe.A, probe.B)])
     policy = jax.tree.map(jnp.asarray, random_policy(0, 2, 2, (), scale=0.3, std=0.5))
