@@ -1,4 +1,4 @@
-"""What every process of the fast tests has: cheap compilation, kept for the others.
+"""What every process of the fast tests has: cheap compilation, kept for the others, and array shapes that are checked.
 
 Most of the suite's time would be XLA's. These flags spare its optimisations, which tiny arrays do not need, and what
 one worker or command has compiled is found by the others and by the next session. JAX finds it by the program, its
@@ -14,9 +14,11 @@ from __future__ import annotations
 import os
 import shutil
 import zlib
+from collections.abc import Iterator
 from contextlib import suppress
 
 import pytest
+from jaxtyping import install_import_hook
 
 from places import ROOT
 
@@ -27,6 +29,7 @@ CHEAP = (
     "--xla_cpu_use_fusion_emitters=false",
     "--xla_cpu_parallel_codegen_split_count=1",
 )
+CHECKED = ("metrpo.model", "metrpo.policy", "metrpo.policy_phase")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -34,8 +37,20 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.02")
     if config.option.markexpr == "not slow":
         os.environ.setdefault("XLA_FLAGS", " ".join(CHEAP))
+        install_import_hook(CHECKED, "shapes.check")
     if not hasattr(config, "workerinput"):  # once a session, not once a worker
         _tidy()
+
+
+@pytest.fixture(scope="module")
+def plain_curve() -> Iterator[None]:
+    """`curve.png` is a text: drawn, it takes half a second of every iteration."""
+    from metrpo.run import directory
+    from metrpo.run.files import atomic_write
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(directory, "draw_curve", lambda rows, path, *_: atomic_write(path, f"{len(rows)} rows"))
+        yield
 
 
 def _tidy() -> None:

@@ -32,6 +32,8 @@ from metrpo.speed.measure import compilations
 from metrpo.stages import ensemble_fit, policy_search, real_steps, records
 from metrpo.world import registry
 
+pytestmark = pytest.mark.usefixtures("plain_curve")
+
 TINY = override(
     Config(task="Probe", iterations=4, evaluation_episodes=2),
     {
@@ -533,7 +535,9 @@ def test_a_phase_on_normalised_states_keeps_the_first_policy(tiny, monkeypatch):
     config, ensemble = override(TINY, {"policy.normalise": True}), random_ensemble(0, 2, 2, 2)
     state, seen = tiny.states[2], []
     monkeypatch.setattr(
-        policy_phase, "values_of", lambda simulator, policy, *_: seen.append((policy, simulator.inputs)) or [0.0]
+        policy_phase,
+        "values_of",
+        lambda simulator, policy, *_: seen.append((policy, simulator.inputs)) or np.array([0.0]),
     )
     policy, *_ = policy_search.improve_policy(config, probe.PROBE, state, ensemble, SILENT, Clock())
     (inside, inputs), *_ = seen

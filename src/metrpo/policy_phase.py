@@ -13,6 +13,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jax.sharding import Mesh
+from jaxtyping import Float, Key
 
 from metrpo import devices
 from metrpo.config import AdvantageConfig, Config
@@ -34,16 +35,16 @@ from metrpo.world.task import Task
 class PhaseInfo(NamedTuple):
     """What one policy phase did."""
 
-    values: np.ndarray
-    """[K], each model's value of the accepted policy."""
+    values: Float[np.ndarray, "K"]
+    """Each model's value of the accepted policy."""
     updates: int
     accepted_updates: int
     """Updates up to the accepted policy."""
     rejected_steps: int
     """Updates that moved nothing: rejected by the line search, or with a gradient that was not finite."""
     validations: int
-    improved: np.ndarray
-    """[K], share of the validations in which each model values the policy above the accepted one, whatever the rule."""
+    improved: Float[np.ndarray, "K"]
+    """Share of the validations in which each model values the policy above the accepted one, whatever the rule."""
     kl: float
     """Mean over the updates."""
     diverged: float
@@ -53,12 +54,11 @@ class PhaseInfo(NamedTuple):
 class Starts(NamedTuple):
     """Where imagined episodes start."""
 
-    pool: np.ndarray
-    """[E, S]"""
+    pool: Float[np.ndarray, "E S"]
     rng: np.random.Generator
 
-    def draw(self, *shape: int) -> np.ndarray:
-        """[*shape, S], with replacement."""
+    def draw(self, *shape: int) -> Float[np.ndarray, "*shape S"]:
+        """So many, with replacement."""
         return self.pool[self.rng.integers(len(self.pool), size=shape)]
 
 
@@ -79,7 +79,7 @@ def improve(
     policy: Policy,
     baseline: Baseline,
     starts: Starts,
-    key: Array,
+    key: Key[Array, ""],
     hooks: Hooks,
 ) -> tuple[Policy, Baseline, PhaseInfo]:
     """Improves `policy` in the simulator and returns the last accepted policy, the baseline and what happened.
@@ -93,10 +93,10 @@ def improve(
     def raw(policy: Policy) -> Policy:
         return policy if inputs is None else folded(policy, inputs)
 
-    def valued(policy: Policy) -> np.ndarray:
+    def valued(policy: Policy) -> Float[np.ndarray, "K"]:
         return values_of(simulator, policy, fixed_starts, settings.advantage, memory.baseline)
 
-    def evidence(policy: Policy, imagined: np.ndarray) -> Evidence:
+    def evidence(policy: Policy, imagined: Float[np.ndarray, "1"]) -> Evidence:
         return Evidence(valued(policy), imagined, cache(lambda: hooks.oracle(raw(policy))))
 
     policy = policy if inputs is None else unfolded(policy, inputs)
@@ -167,15 +167,20 @@ def rollouts_for(steps: int, horizon: int) -> int:
     return -(-steps // horizon)
 
 
-def _last_return(imagined: ImagineInfo) -> np.ndarray:
-    """[1]: of the last update's rollouts; where all of them diverged NaN, which is never an improvement."""
+def _last_return(imagined: ImagineInfo) -> Float[np.ndarray, "1"]:
+    """Of the last update's rollouts; where all of them diverged NaN, which is never an improvement."""
     return np.where(imagined.diverged[-1:] < 1, imagined.mean_return[-1:], np.nan)
 
 
 def run_updates(
-    settings: PhaseSettings, simulator: Simulator, policy: Policy, memory: Memory, starts: np.ndarray, key: Array
+    settings: PhaseSettings,
+    simulator: Simulator,
+    policy: Policy,
+    memory: Memory,
+    starts: Float[Array, "updates N S"],
+    key: Key[Array, ""],
 ) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
-    """Policy updates in one compiled call, one for each batch of start states [updates, N, S]."""
+    """Policy updates in one compiled call, one for each batch of start states."""
     mesh, keys = devices.mesh(starts.shape[1]), jax.random.split(key, len(starts))
     simulator, policy, memory = devices.copied((simulator, policy, memory), mesh)
     return _compiled_updates(settings, mesh, simulator, policy, memory, starts, keys)
@@ -188,16 +193,20 @@ def _compiled_updates(
     simulator: Simulator,
     policy: Policy,
     memory: Memory,
-    starts: Array,
-    keys: Array,
+    starts: Float[Array, "updates N S"],
+    keys: Key[Array, "updates"],
 ) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
     improver = IMPROVERS[settings.improver]
 
     def updates(
-        simulator: Simulator, policy: Policy, memory: Memory, starts: Array, keys: Array
+        simulator: Simulator,
+        policy: Policy,
+        memory: Memory,
+        starts: Float[Array, "updates N S"],
+        keys: Key[Array, "updates"],
     ) -> tuple[Policy, Memory, tuple[ImproveInfo, ImagineInfo]]:
         def update(
-            carry: tuple[Policy, Memory], given: tuple[Array, Array]
+            carry: tuple[Policy, Memory], given: tuple[Float[Array, "N S"], Key[Array, ""]]
         ) -> tuple[tuple[Policy, Memory], tuple[ImproveInfo, ImagineInfo]]:
             policy, memory, infos = improver(settings, partial(_simulate, simulator), *carry, *given)
             return (policy, memory), infos
@@ -210,7 +219,9 @@ def _compiled_updates(
     return after
 
 
-def _simulate(simulator: Simulator, act: Act, starts: Array, key: Array) -> tuple[Trajectories, ImagineInfo]:
+def _simulate(
+    simulator: Simulator, act: Act, starts: Float[Array, "N S"], key: Key[Array, ""]
+) -> tuple[Trajectories, ImagineInfo]:
     """Imagined episodes as the policy sees them."""
     inputs = simulator.inputs
     if inputs is None:
@@ -223,11 +234,11 @@ def _simulate(simulator: Simulator, act: Act, starts: Array, key: Array) -> tupl
 def values_of(
     simulator: Simulator,
     policy: Policy,
-    starts: np.ndarray,
+    starts: Float[Array, "N S"],
     advantage: AdvantageConfig | None = None,
     baseline: Baseline = None,
-) -> np.ndarray:
-    """[K]: mean return of the deterministic policy from `starts` [N, S] in each model alone.
+) -> Float[np.ndarray, "K"]:
+    """Mean return of the deterministic policy from `starts` in each model alone.
 
     Undiscounted over the whole horizon; where the simulator cuts episodes off, discounted as `advantage` says, with the
     value that `baseline` gives to their last state.
@@ -243,19 +254,21 @@ def _compiled_values(
     mesh: Mesh,
     simulator: Simulator,
     policy: Policy,
-    starts: Array,
+    starts: Float[Array, "N S"],
     baseline: Baseline,
-) -> Array:
-    def values(simulator: Simulator, policy: Policy, starts: Array, baseline: Baseline) -> Array:
+) -> Float[Array, "K"]:
+    def values(
+        simulator: Simulator, policy: Policy, starts: Float[Array, "N S"], baseline: Baseline
+    ) -> Float[Array, "K"]:
         inputs = simulator.inputs
 
-        def seen(states: Array) -> Array:
+        def seen(states: Float[Array, "K N S"]) -> Float[Array, "K N S"]:
             return states if inputs is None else normalised(inputs, states)
 
-        def act(states: Array) -> Array:
+        def act(states: Float[Array, "K N S"]) -> Float[Array, "K N A"]:
             return gaussian.mean(policy, seen(states))
 
-        def after(states: Array) -> Array:
+        def after(states: Float[Array, "K N S"]) -> Float[Array, "K N"]:
             assert advantage is not None
             flat = seen(states).reshape(-1, states.shape[-1])
             return VALUE_FUNCTIONS[advantage.baseline].at_cut(baseline, flat).reshape(states.shape[:-1])

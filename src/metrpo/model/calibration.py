@@ -8,6 +8,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float
 
 from metrpo.model.ensemble import Ensemble, predict
 from metrpo.types import Array, Transitions
@@ -31,8 +32,8 @@ class Calibration(NamedTuple):
     number (Naeini et al. 2015)."""
 
 
-def calibration(probabilities: np.ndarray, ended: np.ndarray) -> Calibration:
-    """Of each model's probabilities [K, n], taken into [0, 1], for what `ended` [n] of bool."""
+def calibration(probabilities: Float[np.ndarray, "K n"], ended: Bool[np.ndarray, "n"]) -> Calibration:
+    """Of each model's probabilities, taken into [0, 1], for what `ended`."""
     p, real = np.clip(probabilities, 0.0, 1.0), np.broadcast_to(ended, probabilities.shape)
     seen, bins = p > 0.5, np.minimum((_BINS * p).astype(int), _BINS - 1)
     error = sum(abs(np.sum(p[bins == b]) - np.sum(real[bins == b])) for b in range(_BINS)) / p.size
@@ -49,7 +50,7 @@ def end_calibration(ensemble: Ensemble, held_out: Transitions) -> Calibration:
     """Of the ensemble's last output, the learned end, on the newest of the `held_out` transitions (host arrays)."""
     count = min(len(held_out.states), _MOST)
 
-    def padded(rows: np.ndarray) -> np.ndarray:
+    def padded(rows: Float[Array, "n F"]) -> Float[np.ndarray, "most F"]:
         out = np.zeros((_MOST, rows.shape[1]), np.float32)
         out[:count] = rows[-count:]
         return out
@@ -59,7 +60,7 @@ def end_calibration(ensemble: Ensemble, held_out: Transitions) -> Calibration:
 
 
 @jax.jit
-def _ends(ensemble: Ensemble, states: Array, actions: Array) -> Array:
+def _ends(ensemble: Ensemble, states: Float[Array, "n S"], actions: Float[Array, "n A"]) -> Float[Array, "K n"]:
     members = len(ensemble.networks[0][0])
     copies = [jnp.broadcast_to(x, (members, *x.shape)) for x in (states, actions)]
     return predict(ensemble, *copies)[..., -1]

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int, Key
 
 from metrpo.model.ensemble import Ensemble, predict
 from metrpo.model.imagine import EXPLODED, disagreement
@@ -31,8 +32,8 @@ _LONGEST = 200
 class Diagnosis(NamedTuple):
     """What the models are worth on real episodes that they were not trained on, and in imagination."""
 
-    errors: dict[int, np.ndarray]
-    """After k steps, [S]: root mean square error of the open-loop prediction over that of predicting no change, each
+    errors: dict[int, Float[np.ndarray, "S"]]
+    """After k steps: root mean square error of the open-loop prediction over that of predicting no change, each
     member by itself; 1 is no better than that, NaN where no held-out episode is so long."""
     disagreement_real: float
     """Mean spread of the members' predictions on held-out transitions (`imagine.disagreement`)."""
@@ -67,7 +68,7 @@ def _steps(horizon: int) -> list[int]:
 
 
 def diagnose(
-    ensemble: Ensemble, policy: Policy, held_out: Transitions, train: Transitions, horizon: int, key: Array
+    ensemble: Ensemble, policy: Policy, held_out: Transitions, train: Transitions, horizon: int, key: Key[Array, ""]
 ) -> Diagnosis:
     """A diagnosis of the fitted `ensemble` and the accepted `policy`.
 
@@ -93,8 +94,8 @@ def diagnose(
     return Diagnosis(errors, float(spread.mean()), float(guessed.mean()), float(outside.mean()), float(beyond.mean()))
 
 
-def _starts(t: Transitions, length: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rows to start from, [N], and how many steps of the same episode follow each, [N]."""
+def _starts(t: Transitions, length: int) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]:
+    """Rows to start from, and how many steps of the same episode follow each."""
     size = t.states.shape[1]
     states, after = np.asarray(t.states), np.asarray(t.states) + np.asarray(t.deltas)[:, :size]
     scale = np.abs(states).max(0) + 1e-6
@@ -107,12 +108,14 @@ def _starts(t: Transitions, length: int) -> tuple[np.ndarray, np.ndarray]:
     return chosen, np.minimum(follow[chosen], length)
 
 
-def _evenly(count: int, number: int) -> np.ndarray:
+def _evenly(count: int, number: int) -> Int[np.ndarray, "number"]:
     return np.linspace(0, count - 1, number).astype(int)
 
 
-def _relative(predicted: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """[K, n, S], [n, S], [n, S] -> [S]."""
+def _relative(
+    predicted: Float[np.ndarray, "K n S"], starts: Float[np.ndarray, "n S"], ends: Float[np.ndarray, "n S"]
+) -> Float[np.ndarray, "S"]:
+    """Root mean square error, over that of predicting no change."""
     if not len(ends):
         return np.full(starts.shape[1], np.nan)
     clipped = np.clip(np.nan_to_num(predicted.astype(np.float64), nan=EXPLODED), -EXPLODED, EXPLODED)
@@ -121,25 +124,35 @@ def _relative(predicted: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np
     return np.where(still > 0, error / np.where(still > 0, still, 1.0), np.nan)
 
 
-def _median(values: Sequence[float] | np.ndarray) -> float:
+def _median(values: Sequence[float] | Float[np.ndarray, "S"]) -> float:
     finite = np.asarray(values)[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else float("nan")
 
 
 @jax.jit
 def _rollouts(
-    ensemble: Ensemble, policy: Policy, starts: Array, actions: Array, key: Array
-) -> tuple[Array, Array, Array, Array, Array]:
-    """Every member's open-loop predictions [L, K, N, S], the spread on the starts [N]; and of the policy's imagined
-    episodes the states [L, N, S], the members' spread along them [L, N] and which mean actions saturate [L, N, A]."""
+    ensemble: Ensemble,
+    policy: Policy,
+    starts: Float[Array, "N S"],
+    actions: Float[Array, "N L A"],
+    key: Key[Array, ""],
+) -> tuple[
+    Float[Array, "L K N S"], Float[Array, "N"], Float[Array, "L N S"], Float[Array, "L N"], Bool[Array, "L N A"]
+]:
+    """Every member's open-loop predictions, the spread on the starts; and of the policy's imagined episodes the states,
+    the members' spread along them and which mean actions saturate."""
     size = starts.shape[-1]
     members = ensemble.members
 
-    def open_loop(states: Array, action: Array) -> tuple[Array, Array]:
+    def open_loop(
+        states: Float[Array, "K N S"], action: Float[Array, "N A"]
+    ) -> tuple[Float[Array, "K N S"], Float[Array, "K N S"]]:
         following = predict(ensemble, states, jnp.broadcast_to(action, (members, *action.shape)))[..., :size]
         return following, following
 
-    def imagined(states: Array, key: Array) -> tuple[Array, tuple[Array, Array, Array]]:
+    def imagined(
+        states: Float[Array, "N S"], key: Key[Array, ""]
+    ) -> tuple[Float[Array, "N S"], tuple[Float[Array, "N S"], Float[Array, "N"], Bool[Array, "N A"]]]:
         drawn = gaussian.mean(policy, states)
         mean = jnp.clip(drawn, -1.0, 1.0)
         spread = disagreement(ensemble, states, mean)

@@ -6,17 +6,18 @@ would have to be vmapped to the same products, so the forty lines are written ou
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.experimental.layout import Layout, with_layout_constraint
+from jaxtyping import Float, Int, Key
 
 from metrpo.types import Array, Normaliser, Transitions
 
-Networks = tuple[tuple[Array, Array], ...]
-"""One (weights [K, in, out], biases [K, 1, out]) a layer."""
+Networks = tuple[tuple[Float[Array, "K _in _out"], Float[Array, "K 1 _out"]], ...]
+"""One (weights, biases) a layer."""
 
 
 class Ensemble(NamedTuple):
@@ -30,8 +31,8 @@ class Ensemble(NamedTuple):
         """K."""
         return int(self.networks[0][0].shape[0])
 
-    def outputs(self, x: Array) -> Array:
-        """What the networks say, each member to its own batch: [K, B, I] -> [K, B, D]."""
+    def outputs(self, x: Float[Array, "K B I"]) -> Float[Array, "K B D"]:
+        """What the networks say, each member to its own batch."""
         return network_outputs(self.networks, x)
 
     def first(self) -> Ensemble:
@@ -40,7 +41,7 @@ class Ensemble(NamedTuple):
 
 
 def init(
-    key: Array, members: int, state_size: int, action_size: int, hidden: tuple[int, ...], learned: int = 0
+    key: Key[Array, ""], members: int, state_size: int, action_size: int, hidden: tuple[int, ...], learned: int = 0
 ) -> Networks:
     """Fresh networks: Xavier-uniform weights, zero biases. Member k depends on `key` and k alone, not on K.
 
@@ -48,7 +49,7 @@ def init(
     """
     sizes = (state_size + action_size, *hidden, state_size + learned)
 
-    def one(k: Array) -> Networks:
+    def one(k: Int[Array, ""]) -> tuple[tuple[Float[Array, "_in _out"], Float[Array, "1 _out"]], ...]:
         keys = jax.random.split(jax.random.fold_in(key, k), len(sizes) - 1)
         xavier = jax.nn.initializers.glorot_uniform()
         return tuple(
@@ -62,16 +63,16 @@ def init(
 def normaliser_of(
     train: Transitions, std_floor: float, delta_std_floor: float, unseen: tuple[int, ...] = ()
 ) -> Normaliser:
-    """Means and standard deviations of training data (host arrays, [n, ...]); never of validation data.
+    """Means and standard deviations of training data (host arrays); never of validation data.
 
     `unseen` state dimensions get scale 0, so that the networks cannot see them.
     """
 
     # In NumPy, for JAX would compile every operation again for every size of the data.
-    def mean(x: Array) -> Array:
+    def mean(x: Float[Array, "n F"]) -> Float[Array, "F"]:
         return jnp.asarray(np.mean(np.asarray(x), axis=0, dtype=np.float64), jnp.float32)
 
-    def std(x: Array, floor: float = std_floor) -> Array:
+    def std(x: Float[Array, "n F"], floor: float = std_floor) -> Float[np.ndarray, "F"]:
         return np.maximum(np.std(np.asarray(x), axis=0, dtype=np.float64), floor)
 
     # What does not vary, to float32's precision, has nothing to tell: a tiny divisor would only blow up rounding.
@@ -88,6 +89,7 @@ def normaliser_of(
     )
 
 
+@runtime_checkable
 class Predictor(Protocol):
     """What `predict` needs: an `Ensemble`, or one device's share of it (`metrpo.model.model_parallel`)."""
 
@@ -99,15 +101,17 @@ class Predictor(Protocol):
     def normaliser(self) -> Normaliser:
         """Shared by the members."""
 
-    def outputs(self, x: Array) -> Array:
-        """What the networks say, each member to its own batch: [K, B, I] -> [K, B, D]."""
+    def outputs(self, x: Float[Array, "K B I"]) -> Float[Array, "K B D"]:
+        """What the networks say, each member to its own batch."""
 
     def first(self) -> Predictor:
         """The first member as an ensemble of one."""
 
 
-def predict(ensemble: Predictor, states: Array, actions: Array) -> Array:
-    """Next states and what else is learned, each member for its own batch: [K, B, S], [K, B, A] -> [K, B, D]."""
+def predict(
+    ensemble: Predictor, states: Float[Array, "K B S"], actions: Float[Array, "K B A"]
+) -> Float[Array, "K B D"]:
+    """Next states and what else is learned, each member for its own batch."""
     deltas = predict_delta(ensemble, states, actions)
     size = states.shape[-1]
     if deltas.shape[-1] == size:
@@ -115,8 +119,10 @@ def predict(ensemble: Predictor, states: Array, actions: Array) -> Array:
     return jnp.concatenate([states + deltas[..., :size], deltas[..., size:]], axis=-1)
 
 
-def predict_delta(ensemble: Predictor, states: Array, actions: Array) -> Array:
-    """Changes of state and what else is learned, each member for its own batch: [K, B, S], [K, B, A] -> [K, B, D]."""
+def predict_delta(
+    ensemble: Predictor, states: Float[Array, "K B S"], actions: Float[Array, "K B A"]
+) -> Float[Array, "K B D"]:
+    """Changes of state and what else is learned, each member for its own batch."""
     n = ensemble.normaliser
     inputs = jnp.concatenate(
         [(states - n.state_mean) * n.state_scale, (actions - n.action_mean) * n.action_scale], axis=-1
@@ -124,16 +130,18 @@ def predict_delta(ensemble: Predictor, states: Array, actions: Array) -> Array:
     return n.delta_mean + n.delta_std * ensemble.outputs(inputs)
 
 
-def network_outputs(networks: Networks, x: Array) -> Array:
-    """Each member for its own batch: [K, B, I] -> [K, B, D]."""
+def network_outputs(networks: Networks, x: Float[Array, "K B I"]) -> Float[Array, "K B D"]:
+    """What the networks say, each member to its own batch."""
     *inner, last = networks
     for weights, biases in inner:
         x = jax.nn.relu(layer_outputs(x, weights, biases))
     return layer_outputs(x, *last)
 
 
-def layer_outputs(x: Array, weights: Array, biases: Array) -> Array:
-    """Before the nonlinearity, each member for its own batch: [K, B, I] -> [K, B, O]."""
+def layer_outputs(
+    x: Float[Array, "K B I"], weights: Float[Array, "K I O"], biases: Float[Array, "K 1 O"]
+) -> Float[Array, "K B O"]:
+    """Before the nonlinearity, each member for its own batch."""
     return _product(x, weights) + biases
 
 
@@ -143,19 +151,23 @@ def with_products(networks: Networks, dtype: str) -> Networks:
 
 
 @jax.custom_vjp
-def _product(x: Array, weights: Array) -> Array:
-    """[K, B, I], [K, I, O] -> [K, B, O], float32; of bfloat16 operands where the weights are bfloat16."""
+def _product(x: Float[Array, "K B I"], weights: Float[Array, "K I O"]) -> Float[Array, "K B O"]:
+    """In float32; of bfloat16 operands where the weights are bfloat16."""
     return _forward(x, weights)[0]
 
 
-def _forward(x: Array, weights: Array) -> tuple[Array, tuple[Array, Array]]:
+def _forward(
+    x: Float[Array, "K B I"], weights: Float[Array, "K I O"]
+) -> tuple[Float[Array, "K B O"], tuple[Float[Array, "K B I"], Float[Array, "K I O"]]]:
     if weights.dtype != jnp.bfloat16:
         return jnp.einsum("kbi,kio->kbo", x, weights), (x, weights)
     x = x.astype(jnp.bfloat16)
     return _member_by_member(x, weights), (x, weights)
 
 
-def _backward(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
+def _backward(
+    saved: tuple[Float[Array, "K B I"], Float[Array, "K I O"]], gradient: Float[Array, "K B O"]
+) -> tuple[Float[Array, "K B I"], Float[Array, "K I O"]]:
     x, weights = saved
     if weights.dtype != jnp.bfloat16:
         # JAX's own rule takes g' x and turns it round afterwards; Adam then reads it across its rows, twice.
@@ -171,7 +183,7 @@ def _backward(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array
 _product.defvjp(_forward, _backward)
 
 
-def _member_by_member(a: Array, b: Array) -> Array:
-    """[K, M, N], [K, N, P] -> [K, M, P] in float32; faster than one batched product in bfloat16."""
+def _member_by_member(a: Float[Array, "K M N"], b: Float[Array, "K N P"]) -> Float[Array, "K M P"]:
+    """In float32; faster than one batched product in bfloat16."""
     pairs = zip(a, b, strict=True)
     return jnp.stack([jnp.matmul(x, y, preferred_element_type=jnp.float32) for x, y in pairs])

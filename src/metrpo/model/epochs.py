@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
+from jaxtyping import Float, Int, Key
 
 from metrpo.config import FitConfig
 from metrpo.devices import AXIS, FIRST, WHOLE, spread
@@ -25,7 +26,7 @@ VALIDATION_CHUNK = 1000
 class _Training(NamedTuple):
     networks: Networks
     optimizer: optax.OptState
-    train_loss: Array
+    train_loss: Float[Array, "K"]
 
 
 class FitData(NamedTuple):
@@ -42,13 +43,19 @@ class Progress(NamedTuple):
     networks: Networks
     optimizer: optax.OptState
     best_networks: Networks
-    best_loss: Array
-    best_pass: Array
-    train_loss: Array
+    best_loss: Float[Array, "K"]
+    best_pass: Int[Array, "K"]
+    train_loss: Float[Array, "K"]
 
 
-def loss_of(ensemble: Ensemble, loss_units: str, states: Array, actions: Array, deltas: Array) -> Array:
-    """[K, B]: squared error of the predicted change, summed over state dimensions (paper, eq. 1).
+def loss_of(
+    ensemble: Ensemble,
+    loss_units: str,
+    states: Float[Array, "K B S"],
+    actions: Float[Array, "K B A"],
+    deltas: Float[Array, "K B D"],
+) -> Float[Array, "K B"]:
+    """Squared error of the predicted change, summed over state dimensions (paper, eq. 1).
 
     In "raw" state units (the paper), or each dimension in units of its "std", so that none drowns another.
     """
@@ -59,12 +66,12 @@ def loss_of(ensemble: Ensemble, loss_units: str, states: Array, actions: Array, 
 
 
 @partial(jax.jit, static_argnames="loss_units")
-def validation_loss(ensemble: Ensemble, validation: Transitions, loss_units: str = "raw") -> Array:
-    """[K]: mean of `loss_of` over the first `size` validation transitions; the capacity beyond costs nothing."""
+def validation_loss(ensemble: Ensemble, validation: Transitions, loss_units: str = "raw") -> Float[Array, "K"]:
+    """Mean of `loss_of` over the first `size` validation transitions; the capacity beyond costs nothing."""
     members = ensemble.members
     capacity = validation.states.shape[0]
 
-    def chunk_sum(i: Array, total: Array) -> Array:
+    def chunk_sum(i: Int[Array, ""], total: Float[Array, "K"]) -> Float[Array, "K"]:
         index = i * VALIDATION_CHUNK + jnp.arange(VALIDATION_CHUNK)
         rows = [jnp.take(x, index, axis=0, mode="clip") for x in validation[:3]]
         losses = loss_of(ensemble, loss_units, *(jnp.broadcast_to(x, (members, *x.shape)) for x in rows))
@@ -76,7 +83,13 @@ def validation_loss(ensemble: Ensemble, validation: Transitions, loss_units: str
 
 @partial(jax.jit, static_argnames=("config", "mesh"), donate_argnums=0)
 def train_and_validate(
-    at: Progress, data: FitData, config: FitConfig, mesh: Mesh, key: Array, steps: Array, passes: Array
+    at: Progress,
+    data: FitData,
+    config: FitConfig,
+    mesh: Mesh,
+    key: Key[Array, ""],
+    steps: Int[Array, ""],
+    passes: Int[Array, ""],
 ) -> Progress:
     """`steps` minibatches for every member, each device of `mesh` with its own members, then one validation."""
     own = jax.tree.map(lambda x: FIRST if x.ndim else WHOLE, at)
@@ -85,7 +98,14 @@ def train_and_validate(
     return after
 
 
-def _block(at: Progress, data: FitData, key: Array, steps: Array, passes: Array, config: FitConfig) -> Progress:
+def _block(
+    at: Progress,
+    data: FitData,
+    key: Key[Array, ""],
+    steps: Int[Array, ""],
+    passes: Int[Array, ""],
+    config: FitConfig,
+) -> Progress:
     """One device's share of `train_and_validate`."""
     normaliser, train, validation = data
     optimizer = optimizer_of(config)
@@ -93,19 +113,19 @@ def _block(at: Progress, data: FitData, key: Array, steps: Array, passes: Array,
     first = jax.lax.axis_index(AXIS) * members
     block_key = jax.random.fold_in(key, passes)
 
-    def total_loss(networks: Networks, *batch: Array) -> tuple[Array, Array]:
+    def total_loss(networks: Networks, *batch: Float[Array, "K B _"]) -> tuple[Float[Array, ""], Float[Array, "K"]]:
         ensemble = Ensemble(with_products(networks, config.products), normaliser)
         losses = jnp.mean(loss_of(ensemble, config.loss_units, *batch), axis=-1)
         return jnp.sum(losses), losses
 
-    def train_group(group: _Training, numbers: Array, key: Array) -> _Training:
+    def train_group(group: _Training, numbers: Int[Array, "K"], key: Key[Array, ""]) -> _Training:
         index = minibatch(key, numbers, config.batch_size, train.size)
         batch = (jnp.take(x, index, axis=0) for x in train[:3])
         gradient, losses = jax.grad(total_loss, has_aux=True)(group.networks, *batch)
         change, optimizer_state = optimizer.update(gradient, group.optimizer, group.networks)
         return _Training(optax.apply_updates(group.networks, change), optimizer_state, losses)
 
-    def step(i: Array, groups: list[_Training]) -> list[_Training]:
+    def step(i: Int[Array, ""], groups: list[_Training]) -> list[_Training]:
         step_key = jax.random.fold_in(block_key, i)
         numbers = jnp.split(first + jnp.arange(members), len(groups))
         return [train_group(group, n, step_key) for group, n in zip(groups, numbers, strict=True)]
@@ -117,7 +137,7 @@ def _block(at: Progress, data: FitData, key: Array, steps: Array, passes: Array,
     loss = validation_loss(Ensemble(networks, normaliser), validation, config.loss_units)
     better = loss < at.best_loss  # False for NaN: a diverged member keeps its best weights
 
-    def keep_best(new: Array, best: Array) -> Array:
+    def keep_best(new: Float[Array, "K *rest"], best: Float[Array, "K *rest"]) -> Float[Array, "K *rest"]:
         return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, best)
 
     return Progress(
@@ -151,8 +171,10 @@ def _weights_only(networks: Networks) -> tuple[tuple[bool, bool], ...]:
     return tuple((True, False) for _ in networks)
 
 
-def minibatch(key: Array, numbers: Array, batch_size: int, size: Array) -> Array:
-    """[K, B] indices below `size`, with replacement, for the members `numbers` [K]; each one's depend on its number and
-    `key` alone."""
+def minibatch(
+    key: Key[Array, ""], numbers: Int[Array, "K"], batch_size: int, size: Int[Array, ""] | int
+) -> Int[Array, "K {batch_size}"]:
+    """Indices below `size`, with replacement, for the members `numbers`; each one's depend on its number and `key`
+    alone."""
     keys = jax.vmap(partial(jax.random.fold_in, key))(numbers)
     return jax.vmap(lambda k: jax.random.randint(k, (batch_size,), 0, size))(keys)

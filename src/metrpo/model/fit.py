@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool, Float, Int, Key, Shaped
 
 from metrpo import devices
 from metrpo.config import FitConfig
@@ -24,16 +25,16 @@ class FitInfo(NamedTuple):
 
     passes: int
     """Passes over the training set."""
-    validation_loss: Array
-    """[K], each member's best, in squared `loss_units`."""
-    train_loss: Array
-    """[K], of the last minibatches."""
-    best_pass: Array
-    """[K], the pass after which each member was best."""
-    diverged: np.ndarray
-    """[K] of bool: training ended with weights or a loss that are not finite."""
-    lost: np.ndarray
-    """[K] of bool: no weights are worth keeping: the best are not finite, or training diverged and never improved."""
+    validation_loss: Float[Array, "K"]
+    """Each member's best, in squared `loss_units`."""
+    train_loss: Float[Array, "K"]
+    """Of the last minibatches."""
+    best_pass: Int[Array, "K"]
+    """The pass after which each member was best."""
+    diverged: Bool[np.ndarray, "K"]
+    """Training ended with weights or a loss that are not finite."""
+    lost: Bool[np.ndarray, "K"]
+    """No weights are worth keeping: the best are not finite, or training diverged and never improved."""
     resets: int = 0
     """Members that were lost and fitted again."""
 
@@ -44,14 +45,14 @@ def fit(
     train: Transitions,
     validation: Transitions,
     config: FitConfig,
-    key: Array,
-    on_validation: Callable[[int, Array], None] = lambda passes, losses: None,
+    key: Key[Array, ""],
+    on_validation: Callable[[int, Float[Array, "K"]], None] = lambda passes, losses: None,
 ) -> tuple[Ensemble, FitInfo]:
     """The ensemble fitted to `train`, each member at its own best validation loss.
 
     Stops when no member has improved for `config.patience` passes, at the latest after `config.max_passes` or
     `config.max_steps`.
-    `on_validation(passes, best losses [K])` is called at every validation. Adam starts afresh. Members are spread over
+    `on_validation(passes, best losses)` is called at every validation. Adam starts afresh. Members are spread over
     JAX's devices where their number allows, as the paper suggests (appendix "Real-time complexity").
     """
     optimizer = optimizer_of(config)
@@ -85,7 +86,7 @@ def refit(
     train: Transitions,
     validation: Transitions,
     config: FitConfig,
-    key: Array,
+    key: Key[Array, ""],
 ) -> tuple[Ensemble, FitInfo]:
     """A fitted ensemble with its lost members fitted again, by themselves, from theirs of `fresh`.
 
@@ -93,7 +94,7 @@ def refit(
     """
     lost = np.flatnonzero(info.lost)
 
-    def put(old: Array, new: Array) -> np.ndarray:
+    def put(old: Shaped[Array, "K *rest"], new: Shaped[Array, "_ *rest"]) -> Shaped[np.ndarray, "K *rest"]:
         rows = np.array(old)
         rows[lost] = new
         return rows
@@ -114,7 +115,7 @@ def refit(
     return Ensemble(networks, ensemble.normaliser), merged
 
 
-def _finite(networks: Networks) -> np.ndarray:
-    """[K] of bool."""
+def _finite(networks: Networks) -> Bool[np.ndarray, "K"]:
+    """Of each member, whether all of its weights are."""
     leaves = [np.isfinite(np.asarray(x)) for x in jax.tree.leaves(networks)]
     return np.all([x.all(axis=tuple(range(1, x.ndim))) for x in leaves], axis=0)

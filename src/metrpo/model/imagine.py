@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Key
 
 from metrpo.devices import across, is_spread, share_of, sharers
 from metrpo.model.ensemble import Ensemble, Predictor, predict, predict_delta
@@ -16,8 +17,10 @@ from metrpo.model.sampling import SAMPLINGS, Keys, for_all
 from metrpo.policy.inputs import Inputs
 from metrpo.types import Act, Array, Trajectories
 
-Reward = Callable[[Array, Array, Array], Array]
-Terminated = Callable[[Array], Array] | Literal["learned"]
+Reward = Callable[
+    [Float[Array, "*batch S"], Float[Array, "*batch A"], Float[Array, "*batch S"]], Float[Array, "*batch"]
+]
+Terminated = Callable[[Float[Array, "*batch S"]], Bool[Array, "*batch"]] | Literal["learned"]
 
 EXPLODED = 1e6
 """A rollout with a state beyond this, or a reward beyond its square, has diverged, as has one that meets NaN."""
@@ -26,6 +29,12 @@ CORE_CACHE, FEW_ROWS = 2**21, 100
 """Where a layer has as many bytes of weights as the first, and a core fewer rows for each model than the second, one
 core alone reads more than it computes: the cores of a CPU then share the models instead of the rollouts
 (docs/performance.md, "Models shared by the cores")."""
+
+
+_Going = tuple[Float[Array, "N S"], Float[Array, "N"], Bool[Array, "N"]]
+"""Of imagined episodes: states, 1 where they go on, and which have diverged."""
+_Valued = tuple[Float[Array, "K N S"], Float[Array, "K N"], Float[Array, "K N"]]
+"""Of episodes in each model: states, 1 where they go on, and the return so far."""
 
 
 @jax.tree_util.register_dataclass
@@ -54,18 +63,22 @@ class Simulator:
 class ImagineInfo(NamedTuple):
     """What a batch of imagined rollouts looked like."""
 
-    mean_return: Array
+    mean_return: Float[Array, ""]
     """Undiscounted, over the rollouts that did not diverge."""
-    diverged: Array
+    diverged: Float[Array, ""]
     """Share of the rollouts that exploded or met NaN; they are masked out whole."""
-    steps: Array
+    steps: Float[Array, ""]
     """Steps that count."""
 
 
 def outcome(
-    reward: Reward | None, terminated: Terminated | None, states: Array, actions: Array, predicted: Array
-) -> tuple[Array, Array, Array | None]:
-    """Next states [..., S], rewards [...] and ends [...] (None: never) out of predictions [..., D].
+    reward: Reward | None,
+    terminated: Terminated | None,
+    states: Float[Array, "*batch S"],
+    actions: Float[Array, "*batch A"],
+    predicted: Float[Array, "*batch D"],
+) -> tuple[Float[Array, "*batch S"], Float[Array, "*batch"], Bool[Array, "*batch"] | None]:
+    """Next states, rewards and ends (None: never) out of predictions.
 
     A reward of None is the learned one; a learned end is predicted as its probability, and comes at one half.
     """
@@ -77,16 +90,18 @@ def outcome(
     return following, rewards, None if terminated is None else terminated(following)
 
 
-def disagreement(ensemble: Predictor, states: Array, actions: Array) -> Array:
-    """How far the models' predictions spread, [N, S], [N, A] -> [N]: their standard deviation, in units of each
-    dimension's std in the data, mean over the dimensions (the paper's section "Discussion": a reason to explore)."""
+def disagreement(ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"]) -> Float[Array, "N"]:
+    """How far the models' predictions spread: their standard deviation, in units of each dimension's std in the data,
+    mean over the dimensions (the paper's section "Discussion": a reason to explore)."""
     deltas = predict_delta(ensemble, *(for_all(ensemble, x) for x in (states, actions)))
     deltas = deltas / ensemble.normaliser.delta_std
     return jnp.mean(jnp.std(deltas, axis=0), axis=-1)
 
 
-def imagine(simulator: Simulator, act: Act, starts: Array, key: Array) -> tuple[Trajectories, ImagineInfo]:
-    """Imagined episodes from `starts` [N, S], in which `act` sees the states as they are.
+def imagine(
+    simulator: Simulator, act: Act, starts: Float[Array, "N S"], key: Key[Array, ""]
+) -> tuple[Trajectories, ImagineInfo]:
+    """Imagined episodes from `starts`, in which `act` sees the states as they are.
 
     Actions are clipped to [-1, 1] for dynamics and reward, and recorded as drawn. Where devices share the batch
     (`devices.spread`), the trajectories are this device's, and the info is about all. A CPU's devices share the models
@@ -100,7 +115,7 @@ def imagine(simulator: Simulator, act: Act, starts: Array, key: Array) -> tuple[
     key = share_of(key)
     episode_key = jax.random.fold_in(key, horizon)
 
-    def step(carry: tuple[Array, Array, Array], key: Array) -> tuple[tuple[Array, Array, Array], Trajectories]:
+    def step(carry: _Going, key: Key[Array, ""]) -> tuple[_Going, Trajectories]:
         states, alive, diverged = carry
         action_key, model_key = jax.random.split(key)
         actions = act(states, action_key)
@@ -137,28 +152,27 @@ def _shares_models(ensemble: Ensemble, rows: int) -> bool:
     return largest >= CORE_CACHE and few and can_share(ensemble.networks, sharers())
 
 
-def _sound(states: Array, rewards: Array) -> Array:
-    """[..., S], [...] -> [...]; false for NaN. A batch's squared returns stay within float32 under these bounds."""
+def _sound(states: Float[Array, "*batch S"], rewards: Float[Array, "*batch"]) -> Bool[Array, "*batch"]:
+    """False for NaN. A batch's squared returns stay within float32 under these bounds."""
     return jnp.all(jnp.abs(states) < EXPLODED, axis=-1) & (jnp.abs(rewards) < EXPLODED**2)
 
 
 def returns_per_model(
     simulator: Simulator,
-    act: Callable[[Array], Array],
-    starts: Array,
+    act: Callable[[Float[Array, "K N S"]], Float[Array, "K N A"]],
+    starts: Float[Array, "N S"],
     discount: float = 1.0,
-    after: Callable[[Array], Array] | None = None,
-) -> Array:
-    """[K]: mean return of the deterministic policy `act` from `starts` [N, S], in each model alone.
+    after: Callable[[Float[Array, "K N S"]], Float[Array, "K N"]] | None = None,
+) -> Float[Array, "K"]:
+    """Mean return of the deterministic policy `act` from `starts`, in each model alone.
 
-    What follows the last step is worth `after` of its state,
-    [..., S] -> [...]; without `after`, nothing.
+    What follows the last step is worth `after` of its state; without `after`, nothing.
 
     NaN for a model in which any rollout diverged: such a model cannot vouch for the policy.
     """
     ensemble, horizon, bonus = simulator.ensemble, simulator.horizon, simulator.disagreement
 
-    def step(carry: tuple[Array, Array, Array], weight: Array) -> tuple[tuple[Array, Array, Array], None]:
+    def step(carry: _Valued, weight: Float[Array, ""]) -> tuple[_Valued, None]:
         states, alive, total = carry
         actions = jnp.clip(act(states), -1.0, 1.0)
         predicted = predict(ensemble, states, actions)

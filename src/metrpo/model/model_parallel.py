@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from metrpo.devices import AXIS, part_of
 from metrpo.model.ensemble import Ensemble, Networks, layer_outputs, network_outputs
@@ -38,8 +39,8 @@ class SharedEnsemble(NamedTuple):
         own, remaining = (len(networks[0][0]) for networks in (self.own, self.cut))
         return own * jax.lax.axis_size(AXIS) + remaining
 
-    def outputs(self, x: Array) -> Array:
-        """What the networks say, each member to its own batch: [K, B, I] -> [K, B, D], of this device's states."""
+    def outputs(self, x: Float[Array, "K B I"]) -> Float[Array, "K B D"]:
+        """What the networks say, each member to its own batch, of this device's states."""
         own, remaining = (len(networks[0][0]) for networks in (self.own, self.cut))
         x = jax.lax.all_gather(x, AXIS, axis=1, tiled=True)
         outputs = jnp.zeros((*x.shape[:2], self.own[-1][1].shape[-1]))
@@ -55,7 +56,7 @@ class SharedEnsemble(NamedTuple):
         """No device has one member by itself: samplings that ask for it are not shared (`Sampling.of_drawn_models`)."""
         raise NotImplementedError("expected a sampling that draws a model for each state, got one of the first member")
 
-    def _summands(self, x: Array) -> Array:
+    def _summands(self, x: Float[Array, "K B I"]) -> Float[Array, "K B D"]:
         """This device's part of the remaining members' outputs, which are the sums of the parts."""
         for layer, (weights, biases) in enumerate(self.cut):
             if layer > 0:

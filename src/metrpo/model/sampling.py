@@ -5,17 +5,20 @@ Paper, appendix "Ensemble sampling methods".
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, Int, Key
 
 from metrpo.model.ensemble import Predictor, predict
 from metrpo.types import Array
 
 
-def model_choice(key: Array, count: int, members: int) -> tuple[Array, Array]:
-    """A model for each of `count` states, in equal groups: (slots [K, G], model of every state [count]).
+def model_choice(
+    key: Key[Array, ""], count: int, members: int
+) -> tuple[Int[Array, "{members} G"], Int[Array, "{count}"]]:
+    """A model for each of `count` states, in equal groups: (slots, model of every state).
 
     Row k of `slots` holds the states of model k, padded with `count` (an index out of range). States are dealt to the
     models from a shuffled deck, so each state's model is uniform and independent from step to step, every rollout has
@@ -33,30 +36,39 @@ def model_choice(key: Array, count: int, members: int) -> tuple[Array, Array]:
 class Keys(NamedTuple):
     """Randomness of one imagined step."""
 
-    step: Array
+    step: Key[Array, ""]
     """Another one in every step."""
-    episode: Array
+    episode: Key[Array, ""]
     """The same in all steps of a batch of episodes."""
 
 
+@runtime_checkable
 class Draw(Protocol):
     """The signature of every sampling."""
 
-    def __call__(self, ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
-        """[N, S], [N, A] -> [N, D]: the next states first, then what else is learned."""
+    def __call__(
+        self, ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
+    ) -> Float[Array, "N D"]:
+        """The next states first, then what else is learned."""
 
 
-def step_rand(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
+def step_rand(
+    ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
+) -> Float[Array, "N D"]:
     """One model drawn at random for each state and step (paper, section 5)."""
     return _of_drawn_models(ensemble, states, actions, keys.step)
 
 
-def eps_rand(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
+def eps_rand(
+    ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
+) -> Float[Array, "N D"]:
     """One model drawn at random for each episode."""
     return _of_drawn_models(ensemble, states, actions, keys.episode)
 
 
-def _of_drawn_models(ensemble: Predictor, states: Array, actions: Array, key: Array) -> Array:
+def _of_drawn_models(
+    ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], key: Key[Array, ""]
+) -> Float[Array, "N D"]:
     slots, _ = model_choice(key, states.shape[0], ensemble.members)
     # The blanks repeat the last state; their predictions are dropped.
     grouped = predict(
@@ -65,22 +77,30 @@ def _of_drawn_models(ensemble: Predictor, states: Array, actions: Array, key: Ar
     return jnp.zeros((states.shape[0], grouped.shape[-1])).at[slots].set(grouped, mode="drop")
 
 
-def one_model(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
+def one_model(
+    ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
+) -> Float[Array, "N D"]:
     """The first model, always."""
     return predict(ensemble.first(), states[None], actions[None])[0]
 
 
-def model_mean(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
+def model_mean(
+    ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
+) -> Float[Array, "N D"]:
     """The mean of all models' predictions."""
     return jnp.mean(_of_all_models(ensemble, states, actions), axis=0)
 
 
-def model_med(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
+def model_med(
+    ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
+) -> Float[Array, "N D"]:
     """The median of all models' predictions, dimension by dimension."""
     return jnp.median(_of_all_models(ensemble, states, actions), axis=0)
 
 
-def model_mean_std(ensemble: Predictor, states: Array, actions: Array, keys: Keys) -> Array:
+def model_mean_std(
+    ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
+) -> Float[Array, "N D"]:
     """Drawn from N(mean, std^2) of all models' predictions, dimension by dimension."""
     predictions = _of_all_models(ensemble, states, actions)
     noise = jax.random.normal(keys.step, predictions.shape[1:])
@@ -90,12 +110,14 @@ def model_mean_std(ensemble: Predictor, states: Array, actions: Array, keys: Key
     return jnp.mean(predictions, axis=0) + std * noise
 
 
-def _of_all_models(ensemble: Predictor, states: Array, actions: Array) -> Array:
+def _of_all_models(
+    ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"]
+) -> Float[Array, "K N D"]:
     return predict(ensemble, *(for_all(ensemble, x) for x in (states, actions)))
 
 
-def for_all(ensemble: Predictor, x: Array) -> Array:
-    """[N, ...] -> [K, N, ...], the same for every model."""
+def for_all(ensemble: Predictor, x: Float[Array, "N *rest"]) -> Float[Array, "K N *rest"]:
+    """The same for every model."""
     return jnp.broadcast_to(x, (ensemble.members, *x.shape))
 
 

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from metrpo.devices import across
-from metrpo.types import Array
+from metrpo.types import Array, Number
 
 
-def discounted_returns(rewards: Array, mask: Array, discount: float) -> Array:
-    """Return from every step on, [T, N]; steps with mask 0 give and pass on nothing."""
+def discounted_returns(
+    rewards: Float[Array, "T N"], mask: Float[Array, "T N"], discount: Number
+) -> Float[Array, "T N"]:
+    """Return from every step on; steps with mask 0 give and pass on nothing."""
 
-    def step(following: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
+    def step(
+        following: Float[Array, "N"], at: tuple[Float[Array, "N"], Float[Array, "N"]]
+    ) -> tuple[Float[Array, "N"], Float[Array, "N"]]:
         reward, counts = at
         value = counts * (reward + discount * following)
         return value, value
@@ -21,12 +26,17 @@ def discounted_returns(rewards: Array, mask: Array, discount: float) -> Array:
 
 
 def gae(
-    rewards: Array, values: Array, mask: Array, discount: float, gae_lambda: float, after: Array | None = None
-) -> Array:
-    """Generalised advantage estimates [T, N] (Schulman et al. 2016); the value after the last step that counts is 0.
+    rewards: Float[Array, "T N"],
+    values: Float[Array, "T N"],
+    mask: Float[Array, "T N"],
+    discount: Number,
+    gae_lambda: Number,
+    after: Float[Array, "N"] | None = None,
+) -> Float[Array, "T N"]:
+    """Generalised advantage estimates (Schulman et al. 2016); the value after the last step that counts is 0.
 
     The episode ends there, by termination or by the horizon, which belongs to the task: the return is that of T steps.
-    Episodes that were cut off bring the value `after` [N] their last step.
+    Episodes that were cut off bring the value `after` their last step.
     """
     after = jnp.zeros_like(values[:1]) if after is None else after[None]
     following = jnp.concatenate([(values * mask)[1:], after])
@@ -34,7 +44,7 @@ def gae(
     return discounted_returns(errors, mask, discount * gae_lambda)
 
 
-def standardise(advantages: Array, mask: Array) -> Array:
+def standardise(advantages: Float[Array, "T N"], mask: Float[Array, "T N"]) -> Float[Array, "T N"]:
     """Advantages with mean 0 and standard deviation 1 where `mask` is 1, and 0 elsewhere."""
     count = jnp.maximum(across(jnp.sum(mask)), 1.0)
     mean = across(jnp.sum(advantages * mask)) / count

@@ -7,20 +7,23 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, Key
 
 from metrpo.types import Array
+
+Layers = tuple[tuple[Float[Array, "_in _out"], Float[Array, "_out"]], ...]
+"""One (weights, biases) a layer."""
 
 
 class Policy(NamedTuple):
     """Parameters of the policy; a pytree."""
 
-    layers: tuple[tuple[Array, Array], ...]
-    """One (weights [in, out], biases [out]) a layer."""
-    log_std: Array
-    """[A], the same in every state."""
+    layers: Layers
+    log_std: Float[Array, "A"]
+    """The same in every state."""
 
 
-def init(key: Array, state_size: int, action_size: int, hidden: tuple[int, ...], initial_std: float) -> Policy:
+def init(key: Key[Array, ""], state_size: int, action_size: int, hidden: tuple[int, ...], initial_std: float) -> Policy:
     """A fresh policy: Xavier-uniform weights, zero biases."""
     sizes = (state_size, *hidden, action_size)
     keys = jax.random.split(key, len(sizes) - 1)
@@ -32,8 +35,8 @@ def init(key: Array, state_size: int, action_size: int, hidden: tuple[int, ...],
     return Policy(layers, jnp.full(action_size, math.log(initial_std), jnp.float32))
 
 
-def mean(policy: Policy, states: Array) -> Array:
-    """The mean action: [..., S] -> [..., A]. NumPy in, NumPy out (when the parameters are NumPy), likewise JAX."""
+def mean(policy: Policy, states: Float[Array, "*batch S"]) -> Float[Array, "*batch A"]:
+    """The mean action. NumPy in, NumPy out (when the parameters are NumPy), likewise JAX."""
     xp = states.__array_namespace__()
     *inner, (last_weights, last_biases) = policy.layers
     hidden = states
@@ -42,20 +45,28 @@ def mean(policy: Policy, states: Array) -> Array:
     return hidden @ last_weights + last_biases
 
 
-def sample(policy: Policy, states: Array, key: Array) -> Array:
-    """Actions drawn from the policy: [..., S] -> [..., A]."""
+def sample(policy: Policy, states: Float[Array, "*batch S"], key: Key[Array, ""]) -> Float[Array, "*batch A"]:
+    """Actions drawn from the policy."""
     means = mean(policy, states)
     return means + jnp.exp(policy.log_std) * jax.random.normal(key, means.shape)
 
 
-def log_probability(means: Array, log_std: Array, actions: Array, axis: int = -1) -> Array:
-    """log pi(a | s) of `actions` [..., A] under N(means, exp(log_std)^2): [...]; the actions lie along `axis`."""
+def log_probability(
+    means: Float[Array, "*steps"], log_std: Float[Array, "*std"], actions: Float[Array, "*steps"], axis: int = -1
+) -> Float[Array, "..."]:
+    """log pi(a | s) of `actions` under N(means, exp(log_std)^2); the actions lie along `axis`, and are summed over."""
     z = (actions - means) * jnp.exp(-log_std)
     return -0.5 * jnp.sum(jnp.square(z) + 2 * log_std + math.log(2 * math.pi), axis=axis)
 
 
-def kl(old_means: Array, old_log_std: Array, means: Array, log_std: Array, axis: int = -1) -> Array:
-    """KL(old || new) in every state: [..., A] -> [...]; the actions lie along `axis`."""
+def kl(
+    old_means: Float[Array, "*steps"],
+    old_log_std: Float[Array, "*std"],
+    means: Float[Array, "*steps"],
+    log_std: Float[Array, "*std"],
+    axis: int = -1,
+) -> Float[Array, "..."]:
+    """KL(old || new) in every state; the actions lie along `axis`, and are summed over."""
     ratio = jnp.exp(2 * (old_log_std - log_std))
     distance = jnp.square((old_means - means) * jnp.exp(-log_std))
     return 0.5 * jnp.sum(ratio + distance - 1.0 + 2 * (log_std - old_log_std), axis=axis)
@@ -65,7 +76,7 @@ LIMIT = 0.9
 """Mean actions beyond this are said to saturate: their noise is clipped, so they have little gradient."""
 
 
-def excess(means: Array) -> Array:
+def excess(means: Float[Array, "*steps"]) -> Float[Array, "*steps"]:
     """How far mean actions lie beyond `LIMIT`; signed."""
     return means - jnp.clip(means, -LIMIT, LIMIT)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float, Float32
 
 from metrpo.policy.gaussian import Policy
 from metrpo.types import Array
@@ -17,14 +18,13 @@ from metrpo.types import Array
 class Inputs(NamedTuple):
     """Shift and scale of a policy's inputs: it sees (state - shift) * scale."""
 
-    shift: Array
-    """[S], float32"""
-    scale: Array
-    """[S], float32; 0 where the policy may not see a dimension."""
+    shift: Float32[Array, "S"]
+    scale: Float32[Array, "S"]
+    """0 where the policy may not see a dimension."""
 
 
-def inputs_of(states: np.ndarray, unseen: tuple[int, ...] = ()) -> Inputs:
-    """The normalisation that gives `states` [n, S] mean 0 and standard deviation 1; `unseen` dimensions get scale 0.
+def inputs_of(states: Float[Array, "n S"], unseen: tuple[int, ...] = ()) -> Inputs:
+    """The normalisation that gives `states` mean 0 and standard deviation 1; `unseen` dimensions get scale 0.
 
     A dimension that does not vary is only shifted: differences below float32's resolution are no signal.
     """
@@ -35,8 +35,8 @@ def inputs_of(states: np.ndarray, unseen: tuple[int, ...] = ()) -> Inputs:
     return Inputs(mean.astype(np.float32), scale.astype(np.float32))
 
 
-def normalised(inputs: Inputs, states: Array) -> Array:
-    """What the policy sees of raw `states` [..., S]."""
+def normalised(inputs: Inputs, states: Float[Array, "*batch S"]) -> Float[Array, "*batch S"]:
+    """What the policy sees of raw `states`."""
     return (states - inputs.shift) * inputs.scale
 
 
@@ -62,7 +62,7 @@ def unfolded(policy: Policy, inputs: Inputs) -> Policy:
     return policy._replace(layers=(first, *rest))
 
 
-def _host(policy: Policy) -> list[tuple[np.ndarray, np.ndarray]]:
+def _host(policy: Policy) -> list[tuple[Float[np.ndarray, "_in _out"], Float[np.ndarray, "_out"]]]:
     (weights, biases), *rest = policy.layers
     first = np.asarray(weights, np.float64), np.asarray(biases, np.float64)
     return [first, *((np.asarray(w), np.asarray(b)) for w, b in rest)]

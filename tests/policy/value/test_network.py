@@ -347,7 +347,7 @@ def test_the_setting_chooses_the_baseline(monkeypatch):
     assert_same(init_baseline(deep.advantage, S, KEY), network.init(KEY, S, deep.advantage))
     # What a policy phase leaves is what the next one starts with.
     now = fresh()
-    assert init_memory(PhaseSettings.of(deep, cut=True), None, now).baseline is now
+    assert init_memory(PhaseSettings.of(deep, cut=True), random_policy(0, S, 2), now).baseline is now
 
 
 def test_a_checkpoint_brings_the_network_back(tmp_path):

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, Key
 
 from metrpo.config import GradientConfig
 from metrpo.devices import across
@@ -32,16 +33,16 @@ def improve(
     moments: Any,
     act: Callable[[Policy], Act],
     simulate: Simulate,
-    starts: Array,
+    starts: Float[Array, "N S"],
     config: GradientConfig,
-    key: Array,
+    key: Key[Array, ""],
 ) -> tuple[Policy, Any, tuple[ImproveInfo, Any]]:
-    """One gradient step on the mean return of rollouts from `starts` [N, S] under `act` (one of the two above).
+    """One gradient step on the mean return of rollouts from `starts` under `act` (one of the two above).
 
     Rollouts that diverge count nothing; one that meets NaN makes the gradient NaN, and the update is refused.
     """
 
-    def total_return(policy: Policy) -> tuple[Array, Any]:
+    def total_return(policy: Policy) -> tuple[Float[Array, ""], Any]:
         rollouts, info = simulate(act(policy), starts, key)
         return jnp.sum(rollouts.rewards * rollouts.mask), (rollouts, info)
 

@@ -12,36 +12,34 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
+from metrpo.policy.gaussian import Layers
 from metrpo.types import Array
 
 CHUNK = 1000
 """Steps per chunk: 64 activations of 1,000 steps are 256 kB."""
-
-Layers = tuple[tuple[Array, Array], ...]
-"""One (weights [in, out], biases [out]) a layer."""
 
 
 class Linearised(NamedTuple):
     """The network at C chunks of states."""
 
     layers: Layers
-    inputs: tuple[Array, ...]
-    """Of every layer: [C, in, CHUNK]."""
-    means: Array
-    """[C, A, CHUNK]"""
+    inputs: tuple[Float[Array, "C _in chunk"], ...]
+    """Of every layer."""
+    means: Float[Array, "C A chunk"]
 
 
-def chunked(x: Array) -> Array:
-    """[n, F] or [n] -> [C, F or 1, CHUNK], features first, padded with zeros; a short batch is one chunk of its own."""
+def chunked(x: Float[Array, "n"] | Float[Array, "n F"]) -> Float[Array, "C _ chunk"]:
+    """The steps in chunks of `CHUNK`, features first, padded with zeros; a short batch is one chunk of its own."""
     x = x.reshape(x.shape[0], -1)
     size = min(CHUNK, x.shape[0])
     x = jnp.pad(x, ((0, -x.shape[0] % size), (0, 0)))
     return jnp.swapaxes(x.reshape(-1, size, x.shape[1]), 1, 2)
 
 
-def forward(layers: Layers, states: Array) -> tuple[Array, ...]:
-    """Inputs of every layer and the means, of one chunk of states [S, n]."""
+def forward(layers: Layers, states: Float[Array, "S n"]) -> tuple[Float[Array, "_ n"], ...]:
+    """Inputs of every layer and the means, of one chunk of states."""
     values = [states]
     for i, (weights, biases) in enumerate(layers):
         output = weights.T @ values[-1] + biases[:, None]
@@ -49,29 +47,29 @@ def forward(layers: Layers, states: Array) -> tuple[Array, ...]:
     return tuple(values)
 
 
-def linearise(layers: Layers, states: Array) -> Linearised:
-    """The network at chunked states [C, S, CHUNK]."""
+def linearise(layers: Layers, states: Float[Array, "C S chunk"]) -> Linearised:
+    """The network at chunked states."""
     *inputs, means = jax.lax.map(lambda chunk: forward(layers, chunk), states)
     return Linearised(layers, tuple(inputs), means)
 
 
-def pull_back(at: Linearised, outputs: Array) -> Layers:
-    """J' outputs: [C, A, CHUNK] -> parameters, summed over the steps."""
+def pull_back(at: Linearised, outputs: Float[Array, "C A chunk"]) -> Layers:
+    """J' outputs, shaped as the parameters, summed over the steps."""
     return _sum_over_chunks(at, lambda inputs, given: _backward(at.layers, inputs, given), outputs)
 
 
-def gauss_newton(at: Linearised, weights: Array, tangent: Layers) -> Layers:
-    """J' diag(weights) J tangent, weights [C, A, CHUNK], summed over the steps."""
+def gauss_newton(at: Linearised, weights: Float[Array, "C A chunk"], tangent: Layers) -> Layers:
+    """J' diag(weights) J tangent, summed over the steps."""
     transposed, tangent_transposed = _transposed(at.layers), _transposed(tangent)
 
-    def product(inputs: tuple[Array, ...], given: Array) -> Layers:
+    def product(inputs: _Chunk, given: Float[Array, "A n"]) -> Layers:
         return _backward(at.layers, inputs, given * _tangent(transposed, inputs, tangent_transposed))
 
     return _sum_over_chunks(at, product, weights)
 
 
-def _tangent(layers: Layers, inputs: tuple[Array, ...], tangent: Layers) -> Array:
-    """J tangent of one chunk, [A, n]; the weights of both come transposed, [out, in]."""
+def _tangent(layers: Layers, inputs: _Chunk, tangent: Layers) -> Float[Array, "A n"]:
+    """J tangent of one chunk; the weights of both come transposed, [out, in]."""
     change = jnp.float32(0)
     for i, ((weights, _), (dweights, dbiases)) in enumerate(zip(layers, tangent, strict=True)):
         through = weights @ (change * (1 - jnp.square(inputs[i]))) if i else 0.0
@@ -84,8 +82,8 @@ def _transposed(layers: Layers) -> Layers:
     return jax.lax.optimization_barrier(tuple((weights.T, biases) for weights, biases in layers))
 
 
-def _backward(layers: Layers, inputs: tuple[Array, ...], outputs: Array) -> Layers:
-    """J' outputs of one chunk [A, n]."""
+def _backward(layers: Layers, inputs: _Chunk, outputs: Float[Array, "A n"]) -> Layers:
+    """J' outputs of one chunk."""
     gradients = []
     for i in reversed(range(len(layers))):
         gradients.append((inputs[i] @ outputs.T, jnp.sum(outputs, axis=1)))
@@ -94,8 +92,14 @@ def _backward(layers: Layers, inputs: tuple[Array, ...], outputs: Array) -> Laye
     return tuple(reversed(gradients))
 
 
-def _sum_over_chunks(at: Linearised, term: Callable[[tuple[Array, ...], Array], Layers], given: Array) -> Layers:
-    def add(total: Layers, chunk: tuple[tuple[Array, ...], Array]) -> tuple[Layers, None]:
+_Chunk = tuple[Float[Array, "_ n"], ...]
+"""Of one chunk, the inputs of every layer."""
+
+
+def _sum_over_chunks(
+    at: Linearised, term: Callable[[_Chunk, Float[Array, "A n"]], Layers], given: Float[Array, "C A n"]
+) -> Layers:
+    def add(total: Layers, chunk: tuple[_Chunk, Float[Array, "A n"]]) -> tuple[Layers, None]:
         return jax.tree.map(jnp.add, total, term(*chunk)), None
 
     return jax.lax.scan(add, jax.tree.map(jnp.zeros_like, at.layers), (at.inputs, given))[0]

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int, Key
 
 from metrpo.config import GradientConfig, PPOConfig
 from metrpo.devices import across, share_of
@@ -16,10 +17,13 @@ from metrpo.policy.improvers.adam import ascend
 from metrpo.policy.improvers.batch import Batch, ImproveInfo, by_gradient, mean_kl
 from metrpo.types import Array
 
+_Climb = tuple[Policy, Any, Bool[Array, ""]]
+"""The policy, Adam's moments, and whether every step was made so far."""
+
 
 def clipped_surrogate(
-    policy: Policy, batch: Batch, old_log_probability: Array, clip: float, penalty: float = 0.0
-) -> Array:
+    policy: Policy, batch: Batch, old_log_probability: Float[Array, "n"], clip: float, penalty: float = 0.0
+) -> Float[Array, ""]:
     """sum of min(ratio A, clip(ratio, 1 - clip, 1 + clip) A) over the steps of `batch` (their equation 7).
 
     Less `penalty` times what saturated mean actions cost (`gaussian.saturation`).
@@ -38,7 +42,7 @@ def improve(
     batch: Batch,
     ppo: PPOConfig,
     config: GradientConfig,
-    key: Array,
+    key: Key[Array, ""],
     penalty: float = 0.0,
 ) -> tuple[Policy, Any, ImproveInfo]:
     """`ppo.epochs` passes over `batch`, shuffled anew in each by `key`; `moments` are Adam's.
@@ -50,7 +54,7 @@ def improve(
     minibatches = min(ppo.minibatches, steps)
     size = steps // minibatches
 
-    def step(carry: tuple[Policy, Any, Array], index: Array) -> tuple[tuple[Policy, Any, Array], None]:
+    def step(carry: _Climb, index: Int[Array, "n"]) -> tuple[_Climb, None]:
         policy, moments, sound = carry
         rows = jax.tree.map(partial(jnp.take, indices=index, axis=0), (batch, old_log_probability))
         count = jnp.maximum(across(jnp.sum(rows[0].mask)), 1.0)
@@ -59,7 +63,7 @@ def improve(
         policy, moments, made = ascend(policy, moments, gradient, config)
         return (policy, moments, sound & made), None
 
-    def epoch(carry: tuple[Policy, Any, Array], key: Array) -> tuple[tuple[Policy, Any, Array], None]:
+    def epoch(carry: _Climb, key: Key[Array, ""]) -> tuple[_Climb, None]:
         order = jax.random.permutation(key, steps)[: minibatches * size].reshape(minibatches, size)
         return jax.lax.scan(step, carry, order)[0], None
 

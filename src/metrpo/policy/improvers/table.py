@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Bool, Float, Key
 
 from metrpo.config import AdvantageConfig
 from metrpo.policy import gaussian
@@ -39,20 +40,28 @@ Infos = tuple[ImproveInfo, Any]
 """Of the update, and of the rollouts it learned from."""
 
 
+@runtime_checkable
 class Improver(Protocol):
     """The signature of every improver."""
 
     def __call__(
-        self, settings: PhaseSettings, simulate: Simulate, policy: Policy, memory: Memory, starts: Array, key: Array
+        self,
+        settings: PhaseSettings,
+        simulate: Simulate,
+        policy: Policy,
+        memory: Memory,
+        starts: Float[Array, "N S"],
+        key: Key[Array, ""],
     ) -> tuple[Policy, Memory, Infos]:
-        """One policy update on rollouts from `starts` [N, S]."""
+        """One policy update on rollouts from `starts`."""
 
 
+@runtime_checkable
 class Step(Protocol):
     """One step of an improver that learns from advantages; `key` shuffles."""
 
     def __call__(
-        self, settings: PhaseSettings, policy: Policy, moments: Any, batch: Batch, key: Array
+        self, settings: PhaseSettings, policy: Policy, moments: Any, batch: Batch, key: Key[Array, ""]
     ) -> tuple[Policy, Any, ImproveInfo]:
         """The new policy, Adam's moments and what the step did."""
 
@@ -63,7 +72,7 @@ def init_memory(settings: PhaseSettings, policy: Policy, baseline: Baseline) -> 
 
 
 def batch_of(
-    config: AdvantageConfig, rollouts: Trajectories, baseline: Baseline, key: Array, cut: bool = False
+    config: AdvantageConfig, rollouts: Trajectories, baseline: Baseline, key: Key[Array, ""], cut: bool = False
 ) -> tuple[Batch, Baseline]:
     """The rollouts [T, N] as a batch of T N steps with their advantages under `baseline`; and the baseline refitted.
 
@@ -75,17 +84,17 @@ def batch_of(
     return jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]), batch), baseline
 
 
-def _sound(new: Policy, improved: ImproveInfo, imagined: Any) -> Array:
+def _sound(new: Policy, improved: ImproveInfo, imagined: Any) -> Bool[Array, ""]:
     """Whether an update is to be made: accepted, finite, and learned from at least one step that counts."""
     finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves((new, improved.kl))]
     return improved.accepted & (imagined.steps > 0) & jnp.all(jnp.array(finite))
 
 
-def _where(made: Array, new: Any, old: Any) -> Any:
+def _where(made: Bool[Array, ""], new: Any, old: Any) -> Any:
     return jax.tree.map(partial(jnp.where, made), new, old)
 
 
-def _reported(improved: ImproveInfo, made: Array) -> ImproveInfo:
+def _reported(improved: ImproveInfo, made: Bool[Array, ""]) -> ImproveInfo:
     kl, improvement = (jnp.where(made, x, 0.0) for x in (improved.kl, improved.improvement))
     return improved._replace(kl=kl, improvement=improvement, accepted=made)
 
@@ -94,7 +103,12 @@ def _by_score_function(step: Step) -> Improver:
     """Learns from stochastic rollouts and their advantages; never asks the models for a gradient."""
 
     def update(
-        settings: PhaseSettings, simulate: Simulate, policy: Policy, memory: Memory, starts: Array, key: Array
+        settings: PhaseSettings,
+        simulate: Simulate,
+        policy: Policy,
+        memory: Memory,
+        starts: Float[Array, "N S"],
+        key: Key[Array, ""],
     ) -> tuple[Policy, Memory, Infos]:
         rollouts, imagined = simulate(partial(gaussian.sample, policy), starts, key)
         batch, baseline = batch_of(
@@ -113,7 +127,12 @@ def _through_models(act: Callable[[Policy], Act]) -> Improver:
     """Follows the gradient of the imagined return itself."""
 
     def update(
-        settings: PhaseSettings, simulate: Simulate, policy: Policy, memory: Memory, starts: Array, key: Array
+        settings: PhaseSettings,
+        simulate: Simulate,
+        policy: Policy,
+        memory: Memory,
+        starts: Float[Array, "N S"],
+        key: Key[Array, ""],
     ) -> tuple[Policy, Memory, Infos]:
         new, moments, (improved, imagined) = bptt.improve(
             policy, memory.moments, act, simulate, starts, settings.gradient, key
@@ -126,20 +145,20 @@ def _through_models(act: Callable[[Policy], Act]) -> Improver:
 
 
 def _trpo(
-    settings: PhaseSettings, policy: Policy, moments: Any, batch: Batch, key: Array
+    settings: PhaseSettings, policy: Policy, moments: Any, batch: Batch, key: Key[Array, ""]
 ) -> tuple[Policy, Any, ImproveInfo]:
     new, info = trpo.improve(policy, batch, settings.trpo, settings.mean_penalty)
     return new, moments, info
 
 
 def _ppo(
-    settings: PhaseSettings, policy: Policy, moments: Any, batch: Batch, key: Array
+    settings: PhaseSettings, policy: Policy, moments: Any, batch: Batch, key: Key[Array, ""]
 ) -> tuple[Policy, Any, ImproveInfo]:
     return ppo.improve(policy, moments, batch, settings.ppo, settings.gradient, key, settings.mean_penalty)
 
 
 def _vpg(
-    settings: PhaseSettings, policy: Policy, moments: Any, batch: Batch, key: Array
+    settings: PhaseSettings, policy: Policy, moments: Any, batch: Batch, key: Key[Array, ""]
 ) -> tuple[Policy, Any, ImproveInfo]:
     return vpg.improve(policy, moments, batch, settings.gradient, settings.mean_penalty)
 

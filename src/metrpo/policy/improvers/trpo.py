@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Bool, Float, Int
 
 from metrpo.config import TRPOConfig
 from metrpo.devices import across
@@ -16,6 +16,9 @@ from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers.batch import Batch, ImproveInfo
 from metrpo.policy.improvers.linearised import Linearised, chunked, forward, gauss_newton, linearise, pull_back
 from metrpo.types import Array
+
+_Attempt = tuple[Bool[Array, ""], Float[Array, ""], Float[Array, ""]]
+"""Of a step: whether it is accepted, the surrogate and the KL divergence."""
 
 
 def improve(policy: Policy, batch: Batch, config: TRPOConfig, penalty: float = 0.0) -> tuple[Policy, ImproveInfo]:
@@ -30,13 +33,15 @@ def improve(policy: Policy, batch: Batch, config: TRPOConfig, penalty: float = 0
     old_log_std = policy.log_std[:, None]
     at = linearise(policy.layers, states)
 
-    def cost(means: Array, mask: Array) -> Array:
+    def cost(means: Float[Array, "*steps A n"], mask: Float[Array, "*steps 1 n"]) -> Float[Array, ""]:
         return penalty / count * jnp.sum(mask * gaussian.saturation(means, old_log_std)) if penalty else jnp.float32(0)
 
-    def surrogate_and_kl(new: Policy) -> tuple[Array, Array]:
+    def surrogate_and_kl(new: Policy) -> tuple[Float[Array, ""], Float[Array, ""]]:
         log_std = new.log_std[:, None]
 
-        def add(total: tuple[Array, Array], chunk: tuple[Array, ...]) -> tuple[tuple[Array, Array], None]:
+        def add(
+            total: tuple[Float[Array, ""], Float[Array, ""]], chunk: tuple[Float[Array, "_ n"], ...]
+        ) -> tuple[tuple[Float[Array, ""], Float[Array, ""]], None]:
             states, actions, old_means, weights, mask = chunk
             means = forward(new.layers, states)[-1]
             log_ratio = gaussian.log_probability(means, log_std, actions, 0) - gaussian.log_probability(
@@ -71,16 +76,16 @@ def improve(policy: Policy, batch: Batch, config: TRPOConfig, penalty: float = 0
     step = direction * jnp.sqrt(2 * config.max_kl / jnp.maximum(curvature, 1e-12))
     start = across(jnp.sum(weights) - cost(at.means, mask))
 
-    def attempt(i: Array) -> tuple[Array, Array, Array]:
+    def attempt(i: Int[Array, ""]) -> _Attempt:
         candidate = flat + config.backtrack_ratio**i * step
         surrogate, divergence = surrogate_and_kl(unravel(candidate))
         # Comparisons with NaN are false: a step into NaN is never accepted.
         return (surrogate > start) & (surrogate < jnp.inf) & (divergence <= config.max_kl), surrogate, divergence
 
-    def searching(carry: tuple[Array, tuple[Array, Array, Array]]) -> Array:
+    def searching(carry: tuple[Int[Array, ""], _Attempt]) -> Bool[Array, ""]:
         return ~carry[1][0] & (carry[0] < config.max_backtracks - 1)
 
-    def search(carry: tuple[Array, Any]) -> tuple[Array, tuple[Array, Array, Array]]:
+    def search(carry: tuple[Int[Array, ""], _Attempt]) -> tuple[Int[Array, ""], _Attempt]:
         return carry[0] + 1, attempt(carry[0] + 1)
 
     zero = jnp.int32(0)
@@ -96,8 +101,10 @@ def improve(policy: Policy, batch: Batch, config: TRPOConfig, penalty: float = 0
     )
 
 
-def fisher_product(policy: Policy, at: Linearised, mask: Array, damping: float) -> Callable[[Policy], Policy]:
-    """v -> (F + damping I) v, F the policy's Fisher matrix averaged over the steps where `mask` [C, 1, CHUNK] is 1.
+def fisher_product(
+    policy: Policy, at: Linearised, mask: Float[Array, "C 1 n"], damping: float
+) -> Callable[[Policy], Policy]:
+    """v -> (F + damping I) v, F the policy's Fisher matrix averaged over the steps where `mask` is 1.
 
     The Gaussian's Fisher matrix is J' diag(1 / std^2) J for the mean network and 2 I for log_std (Gauss-Newton), which
     is the Hessian of KL(old || new) at new = old.
@@ -112,10 +119,16 @@ def fisher_product(policy: Policy, at: Linearised, mask: Array, damping: float) 
     return product
 
 
-def conjugate_gradient(product: Callable[[Array], Array], target: Array, iterations: int) -> tuple[Array, Array]:
+_Solving = tuple[Float[Array, "p"], Float[Array, "p"], Float[Array, "p"], Float[Array, ""]]
+"""x, its residual, the next direction and the residual's square."""
+
+
+def conjugate_gradient(
+    product: Callable[[Float[Array, "p"]], Float[Array, "p"]], target: Float[Array, "p"], iterations: int
+) -> tuple[Float[Array, "p"], Float[Array, "p"]]:
     """Solves product(x) = target from x = 0: (x, residual target - product(x))."""
 
-    def step(_: Array, carry: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
+    def step(_: Int[Array, ""], carry: _Solving) -> _Solving:
         x, residual, direction, square = carry
         image = product(direction)
         # Once solved, direction and residual are 0: the guards keep 0 / 0 out.

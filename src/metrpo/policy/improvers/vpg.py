@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float
 
 from metrpo.config import GradientConfig
 from metrpo.devices import across
@@ -16,7 +17,7 @@ from metrpo.policy.improvers.batch import Batch, ImproveInfo, by_gradient, mean_
 from metrpo.types import Array
 
 
-def objective(policy: Policy, batch: Batch, count: Array, penalty: float = 0.0) -> Array:
+def objective(policy: Policy, batch: Batch, count: Float[Array, ""], penalty: float = 0.0) -> Float[Array, ""]:
     """sum of advantage x log pi(a | s), over `count`: its gradient at the policy that acted is the policy gradient.
 
     Less `penalty` times what saturated mean actions cost (`gaussian.saturation`).

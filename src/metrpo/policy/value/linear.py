@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Float, Key
 
 from metrpo.config import AdvantageConfig
 from metrpo.devices import across
 from metrpo.policy.advantage import discounted_returns, gae, standardise
-from metrpo.types import Array, Trajectories
+from metrpo.types import Array, Number, Trajectories
 
 
-def features(states: Array, timeless: bool = False) -> Array:
-    """The baseline's features [o, o^2, t/100, (t/100)^2, (t/100)^3, 1], |o| <= 10: [T, N, S] -> [T, N, 2S + 4].
+def features(states: Float[Array, "T N S"], timeless: bool = False) -> Float[Array, "T N 2*S+4"]:
+    """The baseline's features [o, o^2, t/100, (t/100)^2, (t/100)^3, 1], |o| <= 10.
 
     `timeless` leaves t at 0.
     """
@@ -23,13 +24,15 @@ def features(states: Array, timeless: bool = False) -> Array:
     return jnp.concatenate([observed, jnp.square(observed), t, t**2, t**3, jnp.ones_like(t)], axis=-1)
 
 
-def init(state_size: int) -> Array:
-    """A baseline that predicts 0 everywhere: [2S + 4]."""
+def init(state_size: int) -> Float[Array, "2*{state_size}+4"]:
+    """A baseline that predicts 0 everywhere."""
     return jnp.zeros(2 * state_size + 4)
 
 
-def fit(feature: Array, targets: Array, mask: Array, ridge: float) -> Array:
-    """Ridge regression of `targets` [T, N] on `feature` [T, N, F] where `mask` [T, N] is 1: weights [F].
+def fit(
+    feature: Float[Array, "T N F"], targets: Float[Array, "T N"], mask: Float[Array, "T N"], ridge: Number
+) -> Float[Array, "F"]:
+    """The weights of a ridge regression of `targets` on `feature` where `mask` is 1.
 
     Solved by the normal equations in the columns' own scale, which float32 needs: squares reach 100 and counts 50,000.
     """
@@ -44,9 +47,13 @@ def fit(feature: Array, targets: Array, mask: Array, ridge: float) -> Array:
 
 
 def advantages_and_value(
-    trajectories: Trajectories, baseline: Array, config: AdvantageConfig, key: Array | None = None, cut: bool = False
-) -> tuple[Array, Array]:
-    """Standardised advantages [T, N] under `baseline`, and the baseline refitted to this batch for the next one.
+    trajectories: Trajectories,
+    baseline: Float[Array, "F"],
+    config: AdvantageConfig,
+    key: Key[Array, ""] | None = None,
+    cut: bool = False,
+) -> tuple[Float[Array, "T N"], Float[Array, "F"]]:
+    """Standardised advantages under `baseline`, and the baseline refitted to this batch for the next one.
 
     Trajectories that were `cut` off before their end go on with the baseline's value, which then knows no time. Nothing
     here is drawn: `key` is for the other value functions.
@@ -65,6 +72,6 @@ def advantages_and_value(
     return standardise(advantages, trajectories.mask), refitted
 
 
-def at_cut(baseline: Array, states: Array) -> Array:
-    """[N]: the values of the states [N, S] in which episodes are cut off, whatever the time."""
+def at_cut(baseline: Float[Array, "F"], states: Float[Array, "N S"]) -> Float[Array, "N"]:
+    """The values of the states in which episodes are cut off, whatever the time."""
     return features(states[None], timeless=True)[0] @ baseline

@@ -12,11 +12,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jaxtyping import Float, Key
 
 from metrpo.config import AdvantageConfig
 from metrpo.devices import across, share_of, sharers
 from metrpo.policy import gaussian
 from metrpo.policy.advantage import gae, standardise
+from metrpo.policy.gaussian import Layers
 from metrpo.types import Array, Trajectories
 
 _FAR = 10.0
@@ -26,21 +28,19 @@ _FAR = 10.0
 class Value(NamedTuple):
     """The network, what it needs to go on learning, and its units; a pytree."""
 
-    layers: tuple[tuple[Array, Array], ...]
-    """One (weights [in, out], biases [out]) a layer, tanh between them."""
+    layers: Layers
+    """tanh between them."""
     moments: Any
     """Adam's."""
-    input_mean: Array
-    """[S + 1], of the states and t/100 in the last batch."""
-    input_scale: Array
-    """[S + 1], 1 / std; 0 where an input does not vary."""
-    target_mean: Array
-    """[]"""
-    target_std: Array
-    """[]"""
+    input_mean: Float[Array, "I"]
+    """Of the states and t/100 in the last batch."""
+    input_scale: Float[Array, "I"]
+    """1 / std; 0 where an input does not vary."""
+    target_mean: Float[Array, ""]
+    target_std: Float[Array, ""]
 
 
-def init(key: Array, state_size: int, config: AdvantageConfig) -> Value:
+def init(key: Key[Array, ""], state_size: int, config: AdvantageConfig) -> Value:
     """A fresh network that predicts 0 everywhere."""
     *inner, (last, biases) = gaussian.init(key, state_size + 1, 1, config.value_hidden, 1.0).layers
     layers = (*inner, (jnp.zeros_like(last), biases))
@@ -48,20 +48,20 @@ def init(key: Array, state_size: int, config: AdvantageConfig) -> Value:
     return Value(layers, _optimizer(config).init(layers), inputs, inputs, jnp.float32(0), jnp.float32(1))
 
 
-def inputs(states: Array, timeless: bool = False) -> Array:
-    """What the network sees, [T, N, S] -> [T, N, S + 1]: the states and t/100; `timeless` leaves t at 0."""
+def inputs(states: Float[Array, "T N S"], timeless: bool = False) -> Float[Array, "T N S+1"]:
+    """What the network sees: the states and t/100; `timeless` leaves t at 0."""
     steps, count, _ = states.shape
     time = jnp.zeros(steps) if timeless else jnp.arange(steps, dtype=states.dtype) / 100.0
     return jnp.concatenate([states, jnp.broadcast_to(time[:, None, None], (steps, count, 1))], axis=-1)
 
 
-def predict(value: Value, x: Array) -> Array:
-    """The values of `inputs` [..., S + 1]: [...]."""
+def predict(value: Value, x: Float[Array, "*batch I"]) -> Float[Array, "*batch"]:
+    """The values of `inputs`."""
     return value.target_mean + value.target_std * _network(value.layers, _normalised(value, x))
 
 
-def at_cut(value: Value, states: Array) -> Array:
-    """[N]: the values of the states [N, S] in which episodes are cut off, whatever the time."""
+def at_cut(value: Value, states: Float[Array, "N S"]) -> Float[Array, "N"]:
+    """The values of the states in which episodes are cut off, whatever the time."""
     return predict(value, inputs(states[None], timeless=True)[0])
 
 
@@ -69,10 +69,10 @@ def advantages_and_value(
     trajectories: Trajectories,
     baseline: Value,
     config: AdvantageConfig,
-    key: Array,
+    key: Key[Array, ""],
     cut: bool = False,
-) -> tuple[Array, Value]:
-    """Standardised advantages [T, N] under `baseline`, and the network fitted to this batch for the next one.
+) -> tuple[Float[Array, "T N"], Value]:
+    """Standardised advantages under `baseline`, and the network fitted to this batch for the next one.
 
     As `linear.advantages_and_value` does it with the linear baseline; `key` draws the minibatches.
     """
@@ -89,10 +89,17 @@ def advantages_and_value(
     return standardise(advantages, mask), fit(baseline, *flat, config, key)
 
 
-def fit(value: Value, x: Array, targets: Array, mask: Array, config: AdvantageConfig, key: Array) -> Value:
-    """The network after `config.value_steps` steps of Adam towards `targets` [n] of inputs [n, S + 1].
+def fit(
+    value: Value,
+    x: Float[Array, "n I"],
+    targets: Float[Array, "n"],
+    mask: Float[Array, "n"],
+    config: AdvantageConfig,
+    key: Key[Array, ""],
+) -> Value:
+    """The network after `config.value_steps` steps of Adam towards `targets` of the inputs `x`.
 
-    Minibatches are drawn with replacement where `mask` [n] is 1, by every device from its share of the batch. A fit
+    Minibatches are drawn with replacement where `mask` is 1, by every device from its share of the batch. A fit
     that is not finite, or of nothing, leaves `value` as it is.
     """
     sums = jnp.cumsum(mask)
@@ -105,10 +112,10 @@ def fit(value: Value, x: Array, targets: Array, mask: Array, config: AdvantageCo
     optimizer = _optimizer(config)
     size = -(-config.value_batch_size // sharers())
 
-    def loss(layers: Any, x: Array, z: Array) -> Array:
+    def loss(layers: Layers, x: Float[Array, "n I"], z: Float[Array, "n"]) -> Float[Array, ""]:
         return weight * jnp.mean(jnp.square(_network(layers, _normalised(fresh, x)) - z))
 
-    def step(carry: tuple[Any, Any], key: Array) -> tuple[tuple[Any, Any], None]:
+    def step(carry: tuple[Layers, Any], key: Key[Array, ""]) -> tuple[tuple[Layers, Any], None]:
         layers, moments = carry
         # The r-th step that counts, r uniform: where the sums first pass r.
         index = jnp.searchsorted(sums, jax.random.uniform(key, (size,)) * count, side="right")
@@ -124,11 +131,11 @@ def fit(value: Value, x: Array, targets: Array, mask: Array, config: AdvantageCo
     return jax.tree.map(lambda now, before: jnp.where(sound, now, before), new, value)
 
 
-def _renormalised(value: Value, x: Array, targets: Array, mask: Array) -> Value:
+def _renormalised(value: Value, x: Float[Array, "n I"], targets: Float[Array, "n"], mask: Float[Array, "n"]) -> Value:
     """`value` in the units of this batch: the same network, so that predictions move and stretch with the targets."""
     count = jnp.maximum(across(jnp.sum(mask)), 1.0)
 
-    def mean(rows: Array) -> Array:
+    def mean(rows: Float[Array, "n *rest"]) -> Float[Array, "*rest"]:
         return across(mask @ rows) / count
 
     # Steps that do not count may hold anything, and 0 times infinity is NaN.
@@ -146,11 +153,11 @@ def _renormalised(value: Value, x: Array, targets: Array, mask: Array) -> Value:
     )
 
 
-def _normalised(value: Value, x: Array) -> Array:
+def _normalised(value: Value, x: Float[Array, "*batch I"]) -> Float[Array, "*batch I"]:
     return jnp.clip((x - value.input_mean) * value.input_scale, -_FAR, _FAR)
 
 
-def _network(layers: tuple[tuple[Array, Array], ...], x: Array) -> Array:
+def _network(layers: Layers, x: Float[Array, "*batch I"]) -> Float[Array, "*batch"]:
     *inner, (last_weights, last_biases) = layers
     for weights, biases in inner:
         x = jnp.tanh(x @ weights + biases)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+from jaxtyping import Float, Key
 
 from metrpo.config import AdvantageConfig
 from metrpo.policy.value import linear, network
@@ -13,23 +15,24 @@ Baseline = Any
 """What a value function has learned, a pytree: weights [2S + 4] of the linear one, a `network.Value` of the other."""
 
 
+@runtime_checkable
 class Learn(Protocol):
     """Advantages under what has been learned so far, and what the batch then teaches."""
 
     def __call__(
-        self, trajectories: Trajectories, baseline: Baseline, config: AdvantageConfig, key: Array, cut: bool
-    ) -> tuple[Array, Baseline]:
-        """Standardised advantages [T, N], and the baseline for the next batch; `cut`: episodes go on after the last."""
+        self, trajectories: Trajectories, baseline: Baseline, config: AdvantageConfig, key: Key[Array, ""], cut: bool
+    ) -> tuple[Float[Array, "T N"], Baseline]:
+        """Standardised advantages, and the baseline for the next batch; `cut`: episodes go on after the last."""
 
 
 class ValueFunction(NamedTuple):
     """One way to value states."""
 
-    init: Callable[[Array, int, AdvantageConfig], Baseline]
+    init: Callable[[Key[Array, ""], int, AdvantageConfig], Baseline]
     """(key, S, config) -> a baseline that predicts 0 everywhere."""
     learn: Learn
-    at_cut: Callable[[Baseline, Array], Array]
-    """(baseline, states [N, S]) -> [N]: what follows where episodes are cut off, whatever the time."""
+    at_cut: Callable[[Baseline, Float[Array, "N S"]], Float[Array, "N"]]
+    """(baseline, states) -> what follows where episodes are cut off, whatever the time."""
 
 
 VALUE_FUNCTIONS: dict[str, ValueFunction] = {
@@ -38,6 +41,6 @@ VALUE_FUNCTIONS: dict[str, ValueFunction] = {
 }
 
 
-def init_baseline(config: AdvantageConfig, state_size: int, key: Array) -> Baseline:
+def init_baseline(config: AdvantageConfig, state_size: int, key: Key[Array, ""]) -> Baseline:
     """A baseline that predicts 0 everywhere."""
     return VALUE_FUNCTIONS[config.baseline].init(key, state_size, config)
