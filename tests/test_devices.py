@@ -161,11 +161,11 @@ np.savez(OUT, out)
 """
 
 
-def results(code: str, count: int, out: Path, *flags: str) -> list:
+def results(code: str, count: int, out: Path, *more: str) -> list:
     """What `code` saves to OUT in a process with `count` CPU devices."""
-    flags = " ".join([f"--xla_force_host_platform_device_count={count}", *flags])
+    flags = [os.environ.get("XLA_FLAGS", ""), f"--xla_force_host_platform_device_count={count}", *more]
     tests = os.pathsep.join([str(SUPPORT), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", "PYTHONPATH": tests}
+    environment = os.environ | {"XLA_FLAGS": " ".join(flags), "JAX_PLATFORMS": "cpu", "PYTHONPATH": tests}
     program = PREAMBLE + f"assert len(jax.devices()) == {count}\nOUT = {str(out)!r}\n" + code
     ran = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr

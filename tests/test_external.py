@@ -27,6 +27,8 @@ from metrpo.world import registry
 from metrpo.world.task import Task
 from places import ROOT
 
+pytestmark = pytest.mark.usefixtures("plain_curve")
+
 ROBOT = ROOT / "examples" / "robot"
 SMALL = probe.BRIEF | {"collect.steps": 100, "collect.max_train": 400, "collect.max_validation": 200}
 

@@ -21,6 +21,8 @@ from metrpo.console.progress import Progress
 from metrpo.policy.gaussian import Policy
 from metrpo.presets import override
 
+pytestmark = pytest.mark.usefixtures("plain_curve")
+
 BASE = override(
     Config(task="Probe", evaluation_episodes=10),
     {"collect.steps": 400, "policy.hidden": (8,), "policy.initial_std": 0.3, "ensemble.members": 1},

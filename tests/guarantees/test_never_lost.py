@@ -37,6 +37,8 @@ from metrpo.world import dataset as datasets
 from metrpo.world import registry
 from metrpo.world.task import Task
 
+pytestmark = pytest.mark.usefixtures("plain_curve")
+
 CONFIG = dataclasses.replace(tiny_run.CONFIG, iterations=2)
 
 

@@ -18,6 +18,8 @@ from metrpo.presets import override, preset
 from metrpo.types import Transitions
 from metrpo.world import registry
 
+pytestmark = pytest.mark.usefixtures("plain_curve")
+
 
 def test_by_hand():
     ended = np.array([True, True, False, False, False])

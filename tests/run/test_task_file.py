@@ -22,6 +22,8 @@ from metrpo.training import train
 from metrpo.world import resolve
 from metrpo.world.registry import get_task
 
+pytestmark = pytest.mark.usefixtures("plain_curve")
+
 MAKE = """
     import gymnasium
 

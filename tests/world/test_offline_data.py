@@ -16,6 +16,8 @@ from metrpo.stages import records
 from metrpo.world import collect as real
 from metrpo.world import offline_data
 
+pytestmark = pytest.mark.usefixtures("plain_curve")
+
 
 @pytest.fixture(autouse=True)
 def _probe_is_a_task():

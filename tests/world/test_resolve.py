@@ -27,6 +27,8 @@ from metrpo.world.formula_check import check_formulas
 from metrpo.world.registry import get_task, task_for
 from metrpo.world.resolve import task_of
 
+pytestmark = pytest.mark.usefixtures("plain_curve")
+
 
 class Env(gymnasium.Env):
     """A sound environment of 3 numbers, whose actions lie in [-2, 4] x [0, 1]; variants below break it."""
