@@ -15,7 +15,7 @@ from metrpo.model.ensemble import Ensemble, Predictor, predict, predict_delta
 from metrpo.model.model_parallel import can_share, shared
 from metrpo.model.sampling import SAMPLINGS, Keys, for_all
 from metrpo.policy.inputs import Inputs
-from metrpo.types import Act, Array, Trajectories
+from metrpo.types import Act, Array, Number, Trajectories
 
 Reward = Callable[
     [Float[Array, "*batch S"], Float[Array, "*batch A"], Float[Array, "*batch S"]], Float[Array, "*batch"]
@@ -161,7 +161,7 @@ def returns_per_model(
     simulator: Simulator,
     act: Callable[[Float[Array, "K N S"]], Float[Array, "K N A"]],
     starts: Float[Array, "N S"],
-    discount: float = 1.0,
+    discount: Number = 1.0,
     after: Callable[[Float[Array, "K N S"]], Float[Array, "K N"]] | None = None,
 ) -> Float[Array, "K"]:
     """Mean return of the deterministic policy `act` from `starts`, in each model alone.

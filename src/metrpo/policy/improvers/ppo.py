@@ -15,14 +15,14 @@ from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers.adam import ascend
 from metrpo.policy.improvers.batch import Batch, ImproveInfo, by_gradient, mean_kl
-from metrpo.types import Array
+from metrpo.types import Array, Number
 
 _Climb = tuple[Policy, Any, Bool[Array, ""]]
 """The policy, Adam's moments, and whether every step was made so far."""
 
 
 def clipped_surrogate(
-    policy: Policy, batch: Batch, old_log_probability: Float[Array, "n"], clip: float, penalty: float = 0.0
+    policy: Policy, batch: Batch, old_log_probability: Float[Array, "n"], clip: Number, penalty: float = 0.0
 ) -> Float[Array, ""]:
     """sum of min(ratio A, clip(ratio, 1 - clip, 1 + clip) A) over the steps of `batch` (their equation 7).
 
