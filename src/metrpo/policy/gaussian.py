@@ -81,7 +81,7 @@ def excess(means: Float[Array, "*steps"]) -> Float[Array, "*steps"]:
     return means - jnp.clip(means, -LIMIT, LIMIT)
 
 
-def saturation(means: Array, log_std: Array) -> Array:
+def saturation(means: Float[Array, "*steps"], log_std: Float[Array, "*std"]) -> Float[Array, "*steps"]:
     """What saturated mean actions cost, each of them: the squared excess beyond `LIMIT`, over the standard deviation.
 
     The surrogate's slope in the mean grows as 1 / std, too: else what a narrow policy gains would outweigh any cost.
