@@ -14,10 +14,10 @@ from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers.adam import ascend
 from metrpo.policy.improvers.batch import Batch, ImproveInfo, by_gradient, mean_kl
-from metrpo.types import Array
+from metrpo.types import Array, Number
 
 
-def objective(policy: Policy, batch: Batch, count: Float[Array, ""], penalty: float = 0.0) -> Float[Array, ""]:
+def objective(policy: Policy, batch: Batch, count: Number, penalty: float = 0.0) -> Float[Array, ""]:
     """sum of advantage x log pi(a | s), over `count`: its gradient at the policy that acted is the policy gradient.
 
     Less `penalty` times what saturated mean actions cost (`gaussian.saturation`).
