@@ -208,6 +208,7 @@ def test_several_runs_are_asked_twice():
     assert told == ["stopping 1 run at the end of an iteration; once more stops them at once"]
 
 
+@pytest.mark.timeout(400)  # some 20 s of compilation on a quiet machine
 @pytest.mark.parametrize(("number", "code"), SIGNALS)
 def test_a_process_ends_so(number, code, tmp_path):
     """Asked while it fits for the first time, which takes a while: it is compiled then.
@@ -221,7 +222,7 @@ def test_a_process_ends_so(number, code, tmp_path):
         while not process.stdout.readline().endswith("fit\n"):
             assert process.poll() is None
         process.send_signal(number)
-        _, err = process.communicate(timeout=100)
+        _, err = process.communicate(timeout=350)
     assert process.returncode == code
     assert "metrpo: stopping after this iteration; once more stops at once" in err
     assert "The same command goes on.\n\n  metrpo train Probe --run-dir" in err
