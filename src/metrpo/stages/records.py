@@ -146,6 +146,8 @@ def record(config: Config, task: Task, state: State, done: Done) -> Row:
     trust = _end_calibration(task, dataset, done.ensemble, iteration)
     unfit = partial(scales.count, config, task, dataset, done.episodes)
     row = _outcome(state, returns, done, cut=imagined_horizon(config, task) < task.horizon or task.horizon > RECORDED)
+    if config.validate.real_episodes:
+        row |= {"return_proof": done.verdict.mean, "given_up": int(done.verdict.given_up)}
     row |= {"failed_episodes": done.failed, "failed_evaluation": failed_evaluation(task, returns)}
     row |= {"unfit_dimensions": recorded("unfit_dimensions", iteration, unfit, math.nan)}
     shares = {f"improved_{k}": float(share) for k, share in enumerate(done.improved.improved)}
@@ -164,8 +166,6 @@ def _outcome(state: State, returns: np.ndarray, done: Done, cut: bool) -> Row:
         "return_real_std": float(np.std(returns)),
         "return_collected": collected,
         "return_imagined": imagined,
-        "return_proof": done.verdict.mean,
-        "given_up": int(done.verdict.given_up),
         # What episodes of different lengths earn cannot be compared.
         "gap": math.nan if cut else imagined - float(np.mean(returns)),
         **{f"validation_loss_{k}": float(loss) for k, loss in enumerate(losses)},
