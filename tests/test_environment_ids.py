@@ -29,6 +29,12 @@ def test_metrpo_alone_does_not_import_gymnasium():
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "[]\n"
 
 
+def test_gymnasium_imports_us_for_an_id_with_our_name_before_it():
+    code = "import gymnasium; print(gymnasium.make('metrpo:metrpo/Swimmer-v0').reset(seed=0)[0].shape)"
+    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ran.stdout == "(10,)\n"
+
+
 def test_every_task_has_its_id_and_horizon():
     ours = {task.name: task.horizon for task in metrpo.tasks().values() if (task.env_id or "").startswith("metrpo/")}
     assert ours == HORIZONS

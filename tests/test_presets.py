@@ -86,6 +86,8 @@ OURS = {
     "preset": ("paper", "the label"),
     "seed": (0, "any will do"),
     "data": (None, "nothing is logged elsewhere"),
+    "env_kwargs": ((), "the paper's tasks take none"),
+    "imports": ((), "the paper's tasks are our own"),
     "real_steps": (None, "the budget is given in iterations"),
     "evaluation_episodes": (20, "reporting only: nothing is learned from it"),
     "deterministic": (False, "how the machine computes, not what"),

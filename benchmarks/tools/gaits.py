@@ -20,7 +20,7 @@ SECONDS, FPS, SIDE = 4, 20, 200
 def frames_of(run_dir: Path, seed: int) -> list[Image.Image]:
     """Pictures of an episode's first seconds, as many a second as `FPS` says, with the task's name."""
     policy = load_policy(run_dir)
-    env = task_of_run(run_dir, policy.info.task).make_env(render_mode="rgb_array")
+    env = task_of_run(run_dir, policy.info).make_env(render_mode="rgb_array")
     state, _ = env.reset(seed=seed)
     shown, over = [], False
     per_second = env.metadata["render_fps"]

@@ -11,7 +11,7 @@ import numpy as np
 
 from metrpo.counting import counted
 from metrpo.errors import ConfigError, TaskError
-from metrpo.run.policy_file import LoadedPolicy, load_policy
+from metrpo.run.policy_file import LoadedPolicy, PolicyInfo, load_policy
 from metrpo.run.task_file import task_of_run
 from metrpo.run.video import record
 from metrpo.safe_load import brief
@@ -74,9 +74,11 @@ def evaluate(
     if task is not None or not isinstance(act, LoadedPolicy):
         if task is None:
             raise ConfigError("task: expected the task that this function is to be evaluated on, got none")
-        known = get_task(task)
+        known = _task_at(task, act.info if isinstance(act, LoadedPolicy) else None)
     else:
-        known = task_of_run(policy, act.info.task) if isinstance(policy, str | Path) else get_task(act.info.task)
+        made = act.info
+        of_run = task_of_run(policy, made) if isinstance(policy, str | Path) else None
+        known = of_run or get_task(made.task, made.env_kwargs, made.imports)
     if isinstance(act, LoadedPolicy):
         _require_fit(act, known)
     return EvaluationResult(known.name, seed, collect.evaluate(known, act, episodes, seed))
@@ -92,9 +94,16 @@ def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0, ta
     """
     _require_seed(seed)
     policy = load_policy(run_dir)
-    known = task_of_run(run_dir, policy.info.task) if task is None else get_task(task)
+    known = task_of_run(run_dir, policy.info) if task is None else _task_at(task, policy.info)
     _require_fit(policy, known)
     return record(known.make_env, policy, Path(out or Path(run_dir) / "video.mp4"), seed)
+
+
+def _task_at(task: str, made: PolicyInfo | None) -> Task:
+    """The task of that name: with the policy's own arguments where it may be the policy's task, moved."""
+    if made is None or (":" not in task and task != made.task):
+        return get_task(task)
+    return get_task(task, made.env_kwargs, made.imports)
 
 
 def _require_seed(seed: int) -> None:

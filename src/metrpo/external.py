@@ -43,7 +43,7 @@ def begin(config: Config, run_dir: str | Path) -> None:
         if run.load(state) is not None:
             raise RunDirectoryError(f"{run_dir} holds a run already: go on with metrpo improve, or choose another")
         check(config, known)
-        task_file.remember(run_dir, config.task)
+        task_file.remember(run_dir, config)
         run.begin(state)
 
 
@@ -117,9 +117,9 @@ def improve(run_dir: str | Path, progress: Progress = SILENT, task: str | None =
 def _settled(run_dir: str | Path, config: Config, where: str | None) -> Task:
     """The run's task, known under its name from now on: from its file's old place or the new one."""
     if where is None:
-        task_file.task_of_run(run_dir, config.task)
+        task_file.task_of_run(run_dir, config)
     else:
-        task_file.moved(config.task, where)
+        task_file.moved(config, where)
     return task_for(config)
 
 

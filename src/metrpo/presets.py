@@ -100,7 +100,8 @@ def preset(task: str, name: str = "fast", system: str = "me-trpo", **top_level: 
     if name not in typing.get_args(Preset):
         raise ConfigError(f"preset: expected one of {', '.join(typing.get_args(Preset))}, got {name!r}")
     row = SAME_AS.get(task, task)
-    own = {} if row in PAPER else _generic(task)
+    chosen = {name: top_level[name] for name in _CHOOSE_ENV if name in top_level}
+    own = {} if row in PAPER else _generic(task, chosen)
     overrides = (PAPER.get(row, {}) if name == "paper" else FAST_ALL | FAST.get(row, {})) | own
     if name == "long-horizon":
         overrides |= LONG_HORIZON_ALL
@@ -111,11 +112,25 @@ def preset(task: str, name: str = "fast", system: str = "me-trpo", **top_level: 
     return override(config, overrides | {"system": system} | top_level)
 
 
-def _generic(task: str) -> Overrides:
+_CHOOSE_ENV = ("env_kwargs", "imports")
+"""Settings without which a task may not be found, or have another horizon."""
+
+
+def bare(task: str, name: str, system: str, settings: Overrides) -> Config:
+    """The config of a preset, with those of the dotted `settings` alone that say how the environment is made."""
+    return preset(task, name, system, **{name: settings[name] for name in _CHOOSE_ENV if name in settings})
+
+
+def configured(task: str, name: str, system: str, settings: Overrides) -> Config:
+    """The config of a preset with dotted `settings` on top. Raises `ConfigError` as `preset` and `override`."""
+    return override(bare(task, name, system, settings), settings)
+
+
+def _generic(task: str, chosen: Overrides) -> Overrides:
     """For a task of the user's own: about five episodes an iteration, validated on about 10,000 steps of each model."""
     from metrpo.world.registry import get_task  # known only when a task is asked for that is not in these tables
 
-    horizon = get_task(task).horizon
+    horizon = get_task(task, **chosen).horizon
     return {
         "iterations": 10,
         "collect.steps": min(max(5 * horizon, 1000), 5000),

@@ -100,7 +100,7 @@ def _train(config: Config, run_dir: str | Path | None, progress: Progress) -> Sa
         check(config, task)
         return _loop(config, task, template, progress, lambda state, row: row)
     with RunDirectory(run_dir, config, task.interface) as run:
-        task_file.remember(run_dir, config.task)
+        task_file.remember(run_dir, config)
         state, measured = run.load(template), are_kept(run.path, config.task)
         _say_where(config, run, state or template, measured, progress)
         if state is None:
@@ -130,7 +130,8 @@ def check(config: Config, task: Task) -> None:
             "real returns",
             task.name, f"{task.horizon:,}", f"{RECORDED:,}",
         )  # fmt: skip
-    ours = task.make is None or task.name in KNOWN  # which the tests hold against their environments
+    # Which the tests hold against their environments, as these are without arguments.
+    ours = task.make is None or (task.name in KNOWN and not config.env_kwargs)
     if not (ours or config.trust_reward or config.learn_reward):
         check_formulas(task, rng_of(config.seed, 0, Stage.COLLECT))
 

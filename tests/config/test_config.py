@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from metrpo.config import ADDED, BUDGET_FIELDS, Config, difference, flatten, from_json, to_json
+from metrpo.config.env_kwargs import canonical
 from metrpo.errors import ConfigError
 from metrpo.presets import override
 from metrpo.run.files import folder_name
@@ -25,14 +26,23 @@ KINDS = {
     str: st.text(min_size=1),
 }
 
+_names = st.from_regex(r"[a-z_]{1,4}", fullmatch=True)
+_values = st.none() | st.booleans() | st.integers() | st.text()
+OWN = {
+    "env_kwargs": st.dictionaries(_names, _values, max_size=3).map(canonical),
+    "imports": st.lists(_names, max_size=2).map(tuple),
+    "real_episodes": st.just(0) | st.integers(2, 10**6),
+}
+"""Settings that are not any value of their type."""
+
 
 def strategy(kind):
     if dataclasses.is_dataclass(kind):
         hints = typing.get_type_hints(kind)
-        fields = {f.name: strategy(hints[f.name]) for f in dataclasses.fields(kind)}
-        if "real_episodes" in fields:
-            fields["real_episodes"] = fields["real_episodes"].filter(lambda n: n > 1)
-        return st.builds(kind, **fields)
+        return st.builds(
+            kind,
+            **{f.name: OWN[f.name] if f.name in OWN else strategy(hints[f.name]) for f in dataclasses.fields(kind)},
+        )
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Literal:
         return st.sampled_from(arguments)
@@ -173,6 +183,8 @@ FREE |= {
     "trust_reward",
     "data",
     "learn_reward",
+    "env_kwargs",
+    "imports",
 }
 
 

@@ -130,8 +130,9 @@ def test_python_describes_itself(tmp_path):
     module = python(path)
     assert (module.OBSERVATION_SIZE, module.ACTION_SIZE, module.TASK) == (S, A, "Swimmer")
     beside = json.loads((tmp_path / "policy.json").read_text())
+    plain = {"hidden": [8], "env_kwargs": [], "imports": []}
     origin = {"metrpo": beside["metrpo"], "policy_sha256": beside["sha256"]}
-    assert {**dataclasses.asdict(load_policy(tmp_path).info), "hidden": [8], **origin} == module.INFO
+    assert {**dataclasses.asdict(load_policy(tmp_path).info), **plain, **origin} == module.INFO
     for fact in ("from policy import act", "S = 11, A = 3", "environment: Swimmer.", *origin.values(), "3 iterations"):
         assert fact in module.__doc__
     assert str(tmp_path) not in path.read_text()

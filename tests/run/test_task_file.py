@@ -1,5 +1,6 @@
 """Tasks out of files and modules: neighbours, the current folder, Gymnasium's own form, and files that have moved."""
 
+import contextlib
 import dataclasses
 import json
 import sys
@@ -8,11 +9,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
+import numpy as np
 import pytest
 
 from helpers import random_policy
 from metrpo.commands import main
-from metrpo.config import to_json
+from metrpo.commands.parse import parse
+from metrpo.config import Config, to_json
 from metrpo.errors import ConfigError, TaskError
 from metrpo.external import begin
 from metrpo.presets import override, preset
@@ -116,12 +119,13 @@ def test_two_files_of_one_name_are_two_tasks(monkeypatch):
     assert get_task("mine.py:make").horizon == 25, "what the name means here"
 
 
-def a_run(run_dir, task):
+def a_run(run_dir, task, **choice):
     """What a run of a file's task leaves, as far as evaluating it goes."""
     run_dir.mkdir()
     (run_dir / "run.json").write_text('{"format": 1}')
-    remember(run_dir, task)
-    save_policy(run_dir, random_policy(0, 3, 1), task, 1, 200, 1.5)
+    config = Config(task, **choice)
+    remember(run_dir, config)
+    save_policy(run_dir, random_policy(0, 3, 1), task, 1, 200, 1.5, settings=config)
 
 
 def evaluated(capsys, *arguments):
@@ -265,16 +269,80 @@ def test_init_names_only_what_can_add_episodes_to_its_task(monkeypatch, capsys):
 
 def test_only_what_lies_in_a_file_or_module_can_have_moved():
     with pytest.raises(ConfigError, match="task: expected it for a run whose task lies in a file or module, got"):
-        moved("Swimmer", "there/mine.py:make")
+        moved(Config("Swimmer"), "there/mine.py:make")
 
 
 def test_run_json_of_other_tasks_says_no_file(tmp_path):
     (tmp_path / "run.json").write_text('{"format": 1}')
-    remember(tmp_path, "Swimmer")
+    remember(tmp_path, Config("Swimmer"))
     assert (tmp_path / "run.json").read_text() == '{"format": 1}'
     # Made up by somebody else: it names another file than the task does.
     write("mine.py", MAKE, horizon=5)
     write("there/evil.py", "raise SystemExit(9)\n")
     (tmp_path / "run.json").write_text(json.dumps({"format": 1, "task_file": str(tmp_path / "there" / "evil.py")}))
-    assert task_of_run(tmp_path, "mine.py:make").horizon == 5
-    assert dataclasses.is_dataclass(task_of_run(tmp_path, "Swimmer"))
+    assert task_of_run(tmp_path, Config("mine.py:make")).horizon == 5
+    assert dataclasses.is_dataclass(task_of_run(tmp_path, Config("Swimmer")))
+
+
+# ---------------------------------------------------------------- arguments and imports
+
+TILTED = """
+    import gymnasium
+    from gymnasium.wrappers import TimeLimit
+    def tilted(horizon=20, mode="easy", **kwargs):
+        assert mode in ("easy", "hard"), mode
+        return TimeLimit(gymnasium.make("Pendulum-v1", **kwargs).unwrapped, horizon)
+    gymnasium.register("Tilted-v0", entry_point=tilted, max_episode_steps=30)
+"""
+
+
+@pytest.fixture
+def tilted(monkeypatch):
+    """A module there/tilting.py that registers an id, in the current folder."""
+    write("there/tilting.py", TILTED)
+    monkeypatch.chdir("there")
+
+
+def gravity(task):
+    with contextlib.closing(task.make_env()) as env:
+        return env._env.unwrapped.g
+
+
+def test_an_imported_id_with_arguments_is_rebuilt_from_anywhere(tmp_path, tilted, monkeypatch, capsys):
+    typed = ["Tilted-v0", "--import", "tilting", "--env-kwargs", "g=2.5", "mode=hard"]
+    config = parse(["train", *typed]).config
+    assert (config.env_kwargs, config.imports) == (("g=2.5", "mode=hard"), ("tilting",))
+    a_run(tmp_path / "run", config.task, env_kwargs=config.env_kwargs, imports=config.imports)
+    monkeypatch.chdir(tmp_path)
+    forgotten(monkeypatch, "tilting")
+    gymnasium.registry.pop("Tilted-v0")
+    made = []
+    monkeypatch.setattr("metrpo.evaluation.collect.evaluate", lambda task, *_: made.append(task) or np.zeros(1))
+    assert evaluated(capsys, "run") == (0, "Tilted-v0")
+    assert gravity(made[0]) == 2.5
+    monkeypatch.setattr("metrpo.evaluation.record", lambda make_env, *_: made.append(make_env.__self__) or tmp_path)
+    assert main.main(["render", "run"]) == 0
+    assert gravity(made[1]) == 2.5
+    with pytest.raises(TaskError, match="AssertionError: odd"):
+        get_task("Tilted-v0", {"mode": "odd"})
+
+
+def test_a_file_that_moved_keeps_its_arguments(tmp_path, tilted, monkeypatch, capsys):
+    assert get_task("tilting.py:tilted", {"horizon": 7}).horizon == 7
+    a_run(tmp_path / "run", "tilting.py:tilted", env_kwargs=("g=3.5",))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").rename(tmp_path / "moved")
+    monkeypatch.setattr(resolve, "_PLACES", {})
+    gymnasium.registry.pop("Tilted-v0")  # the file registers it once more from its new place
+    made = []
+    monkeypatch.setattr("metrpo.evaluation.collect.evaluate", lambda task, *_: made.append(task) or np.zeros(1))
+    assert evaluated(capsys, "run", "--task", "moved/tilting.py:tilted") == (0, "moved/tilting.py:tilted")
+    assert evaluated(capsys, "run", "--task", "Pendulum-v1")[0] == 0
+    assert list(map(gravity, made)) == [3.5, 10.0]
+    moved(Config("tilting.py:tilted", env_kwargs=("g=3.5",)), "moved/tilting.py:tilted")
+    assert gravity(get_task("tilting.py:tilted", {"g": 3.5})) == 3.5
+
+
+def test_a_missing_import_is_said(tmp_path, capsys):
+    assert main.main(["train", "Pendulum-v1", "--import", "nowhere_at_all"]) == 2
+    assert "imports nowhere_at_all: expected a module nowhere_at_all in " in capsys.readouterr().err

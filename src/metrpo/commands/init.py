@@ -26,12 +26,12 @@ def run(command: Init) -> int:
     """Returns the exit code."""
     from metrpo.external import begin
     from metrpo.run.policy_file import FILE
-    from metrpo.world.registry import get_task
+    from metrpo.world.registry import task_for
 
     config, run_dir = command.config, command.directory
     begin(config, run_dir)
     collect = f"metrpo collect {shlex.quote(str(run_dir))}"
-    how = collect if get_task(config.task).playable else f"metrpo.append_episode, or {collect} --data FILE"
+    how = collect if task_for(config).playable else f"metrpo.append_episode, or {collect} --data FILE"
     print(f"{run_dir / FILE} is the untrained policy; add episodes ({how}), then")
     print(f"metrpo improve {shlex.quote(str(run_dir))}")
     return 0

@@ -22,6 +22,10 @@ class RunOptions(Config):
 
     task: Annotated[Positional[str], arg(metavar="TASK")] = "Swimmer"
     """Name of the task (see: metrpo tasks), a Gymnasium id, module:name or path/to/file.py:name."""
+    env_kwargs: Annotated[tuple[str, ...], arg(metavar="KEY=VALUE...")] = ()
+    """Keyword arguments that the environment is made with: g=5.0 mode=easy 'size=[1, 2]'."""
+    imports: Annotated[tuple[str, ...], arg(name="import", aliases=("--imports",), metavar="MODULE...")] = ()
+    """Modules to import first: those that register the environment."""
     preset: Preset = "fast"
     """What all other settings start from. fast: learns soonest on two CPU cores; paper: the paper's values;
     long-horizon: for tasks of 1,000 steps."""
@@ -69,6 +73,7 @@ FEW = frozenset(
         "system",
         "data",
         "learn_reward",
+        "env_kwargs",
         "evaluation_episodes",
         "run_dir",
         "device",

@@ -55,8 +55,9 @@ def _parse_run(kind: type[RunOptions], arguments: list[str], asked: str | None) 
     machine.prepare(first.device, first.deterministic)
     from metrpo.world.registry import get_task
 
-    task = get_task(first.task).name
-    defaults = _defaults(kind, preset(task, first.preset, first.system))
+    task = get_task(first.task, first.env_kwargs, first.imports).name
+    given = {"env_kwargs": first.env_kwargs, "imports": first.imports}
+    defaults = _defaults(kind, preset(task, first.preset, first.system, **given))
     if asked is not None:
         _show(kind, defaults, arguments[0], only)
     parsed = understood(lambda: _tyro(kind, defaults, arguments), kind, arguments)

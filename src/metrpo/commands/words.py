@@ -53,8 +53,16 @@ def joined(arguments: Sequence[str], lists: Collection[str]) -> list[str]:
 
 def lists_of(kind: type) -> set[str]:
     """The options of a command that take several values."""
+    hints = typing.get_type_hints(kind, include_extras=True)
     fields = [f for f in dataclasses.fields(kind) if isinstance(f.default, tuple)]
-    return {f"--{f.name.replace('_', '-')}" for f in fields}
+    return {option for f in fields for option in _spelt(f.name, hints[f.name])}
+
+
+def _spelt(name: str, hint: object, prefix: str = "") -> list[str]:
+    """How an option is typed: by its field's name, or as its mark `arg` says."""
+    marks = getattr(hint, "__metadata__", ())
+    own = next((mark.name for mark in marks if getattr(mark, "name", None)), name.replace("_", "-"))
+    return [f"--{prefix}{own}", *(alias for mark in marks for alias in getattr(mark, "aliases", None) or ())]
 
 
 def command_of(arguments: Sequence[str], commands: Collection[str]) -> str:
@@ -159,7 +167,7 @@ def options_of(kind: type, prefix: str = "") -> list[str]:
         if isinstance(base, type) and dataclasses.is_dataclass(base):
             found += options_of(base, prefix if tyro.conf.OmitArgPrefixes in marks else f"{name}.")
         else:
-            found += [f"--no-{name}"] if field.default is True else [f"--{name}"]
+            found += [f"--no-{name}"] if field.default is True else _spelt(field.name, hint, prefix)
             if base is bool and tyro.conf.FlagCreatePairsOff not in marks:
                 found.append(f"--{prefix}no-{name.removeprefix(prefix)}")
     return found

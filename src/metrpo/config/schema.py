@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from metrpo.config.checks import nonnegative, positive, require
+from metrpo.config.env_kwargs import canonical
 
 
 @dataclass(frozen=True)
@@ -336,6 +337,10 @@ class Config:
 
     task: str
     """Name of a registered task (see `metrpo tasks`)."""
+    env_kwargs: tuple[str, ...] = ()
+    """Keyword arguments that the task's environment is made with, each KEY=VALUE; in Python a dict will do, too."""
+    imports: tuple[str, ...] = ()
+    """Modules that are imported before the task is looked up: those that register its environment."""
     preset: Preset = "fast"
     """The preset that the values came from; a label, the values themselves count."""
     seed: int = 0
@@ -377,10 +382,17 @@ class Config:
 
     def __post_init__(self) -> None:
         require(bool(self.task), "task", self.task, "a task name")
+        object.__setattr__(self, "env_kwargs", canonical(self.env_kwargs))
+        for module in self.imports:
+            require(_is_module(module), "imports", module, "the name of a module")
         require(0 <= self.seed < 2**31, "seed", self.seed, "between 0 and 2^31 - 1")
         require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
         require(self.real_steps is None or self.real_steps >= 0, "real_steps", self.real_steps, "at least 0")
         require(self.evaluation_episodes >= 1, "evaluation_episodes", self.evaluation_episodes, "at least 1")
+
+
+def _is_module(name: str) -> bool:
+    return all(part.isidentifier() for part in name.split("."))
 
 
 BUDGET_FIELDS = ("iterations", "real_steps")

@@ -10,6 +10,7 @@ import types
 import typing
 from typing import Any, Literal
 
+from metrpo.config import env_kwargs
 from metrpo.config.schema import BUDGET_FIELDS, Config
 from metrpo.errors import ConfigError
 from metrpo.safe_load import brief, json_of
@@ -35,6 +36,8 @@ ADDED = (
     "config.ppo",
     "config.svg",
     "config.data",
+    "config.env_kwargs",
+    "config.imports",
     "config.learn_reward",
     "config.trust_reward",
 )
@@ -100,6 +103,8 @@ def convert(kind: Any, value: Any, where: str) -> Any:
     """
     if dataclasses.is_dataclass(kind):
         return value if isinstance(value, typing.cast(type, kind)) else _build(typing.cast(type, kind), value, where)
+    if isinstance(value, dict) and where.rpartition(".")[2] == "env_kwargs":
+        return env_kwargs.canonical(value)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is types.UnionType:
         return None if value is None else convert(arguments[0], value, where)

@@ -56,11 +56,12 @@ class Grid:
         if unknown := [s for s in self.systems if s not in get_args(System)]:
             raise ConfigError(f"sweep: systems: expected some of {', '.join(get_args(System))}, got {unknown[0]}")
         found = []
-        tasks = [get_task(task).name for task in self.tasks]
-        for seed, task, system, values in itertools.product(
-            self.seeds, tasks, self.systems, itertools.product(*columns)
+        for seed, given, system, values in itertools.product(
+            self.seeds, self.tasks, self.systems, itertools.product(*columns)
         ):
             overrides = tuple((name, _hashable(value)) for name, value in zip(names, values, strict=True))
+            made = dict(overrides)
+            task = get_task(given, made.get("env_kwargs", ()), made.get("imports", ())).name
             variant = _variant(system, overrides)
             found.append(RunSpec(task, system, seed, budget + overrides, self.preset, variant))
         for run in found:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from metrpo.config import Config, Preset, flatten
-from metrpo.presets import override, preset
+from metrpo.presets import bare, configured
 from metrpo.run.files import folder_name
 
 
@@ -31,13 +31,13 @@ class RunSpec:
     @property
     def config(self) -> Config:
         """All its settings."""
-        return override(preset(self.task, self.preset, self.system, seed=self.seed), dict(self.overrides))
+        return configured(self.task, self.preset, self.system, {"seed": self.seed, **dict(self.overrides)})
 
     @property
     def arguments(self) -> list[str]:
         """What follows `metrpo train` to run it."""
         words = [self.task, "--system", self.system, "--preset", self.preset, "--seed", str(self.seed)]
-        usual = flatten(preset(self.task, self.preset, self.system))
+        usual = flatten(bare(self.task, self.preset, self.system, dict(self.overrides)))
         for name, value in self.overrides:
             group, dot, own = (option := name.replace("_", "-")).rpartition(".")
             if not isinstance(value, bool):

@@ -238,7 +238,7 @@ class RunDirectory:
         result = result if result is not None and math.isfinite(result) else None
         progress = (state.iteration, state.real_steps, result)
         origin = getattr(state, "origin", None)  # baselines have none
-        save_policy(self.path, state.policy, self.config.task, *progress, self.interface, origin)
+        save_policy(self.path, state.policy, self.config.task, *progress, self.interface, origin, self.config)
 
     def _draw_curve(self) -> None:
         title = f"{self.config.task}, {self.config.system}, {self.config.preset}, seed {self.config.seed}"

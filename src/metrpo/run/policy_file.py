@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from metrpo.config import Config
 from metrpo.errors import RunDirectoryError
 from metrpo.run.files import FORMAT, atomic_write, inside, metrpo_version, read_arrays, write_arrays
 from metrpo.safe_load import brief
@@ -45,12 +46,20 @@ class PolicyInfo:
     """[A], what the environment takes for an action of -1; None: unknown."""
     action_high: tuple[float, ...] | None = None
     """[A], what it takes for an action of 1; None: unknown."""
+    env_kwargs: tuple[str, ...] = ()
+    """What its environment was made with, each KEY=VALUE (`metrpo.config.env_kwargs`)."""
+    imports: tuple[str, ...] = ()
+    """Modules that register its environment."""
 
 
 _MOST = 1e300
 """Beyond it the difference of two bounds may overflow."""
-_SINCE = ("observation", "action_low", "action_high")
-"""Fields that older policies lack."""
+_SHOWN = ("observation", "action_low", "action_high")
+"""Fields that say what the environment shows and takes."""
+_MADE = ("env_kwargs", "imports")
+"""Fields that say how the environment is made."""
+_SINCE = dict.fromkeys(_SHOWN) | {"env_kwargs": [], "imports": []}
+"""Fields that older policies lack, and what that means."""
 
 
 class Interface(Protocol):
@@ -138,10 +147,11 @@ def save_policy(
     return_real: float | None,
     interface: Interface | None = None,
     origin: np.ndarray | None = None,
+    settings: Config | None = None,
 ) -> None:
     """Writes `policy.npz` (weights and info) and `policy.json` (the info for people and other programs).
 
-    `origin` [S], float64, is what its observations are counted from.
+    `origin` [S], float64, is what its observations are counted from; `settings` are the run's.
 
     Raises `RunDirectoryError` when they cannot be written.
     """
@@ -149,6 +159,8 @@ def save_policy(
     hidden = tuple(len(b) for _, b in layers[:-1])
     info = PolicyInfo(task, layers[0][0].shape[0], layers[-1][0].shape[1], hidden, iteration, real_steps, return_real)
     info = with_interface(info, interface)
+    if settings is not None:
+        info = replace(info, **{name: getattr(settings, name) for name in _MADE})
     arrays = {f"{kind}{i}": array for i, layer in enumerate(layers) for kind, array in zip("wb", layer, strict=True)}
     arrays["log_std"] = np.asarray(policy.log_std)
     if origin is not None and origin.any():
@@ -166,7 +178,7 @@ def with_interface(info: PolicyInfo, interface: Interface | None) -> PolicyInfo:
     sizes = (sum(size for size, _ in interface.observation), len(interface.action_low), len(interface.action_high))
     if sizes != (info.observation_size, info.action_size, info.action_size):  # it would not be read again
         return info
-    return replace(info, **{name: getattr(interface, name) for name in _SINCE})
+    return replace(info, **{name: getattr(interface, name) for name in _SHOWN})
 
 
 def load_policy(directory: str | Path) -> LoadedPolicy:
@@ -205,7 +217,7 @@ def _info(stored: Any, path: Path) -> PolicyInfo:
         raise RunDirectoryError(f"{path} is no policy: it lacks {', '.join(missing)}")
     if unknown := [name for name in stored if name not in names]:
         raise RunDirectoryError(f"{path}: expected what this version knows of a policy, got {brief(unknown)}")
-    stored = dict.fromkeys(_SINCE) | stored
+    stored = _SINCE | stored
     sizes, parts = stored["hidden"], stored["observation"]
     for name, sound, expected in (
         ("task", isinstance(stored["task"], str), "a name"),
@@ -214,7 +226,8 @@ def _info(stored: Any, path: Path) -> PolicyInfo:
         ("hidden", isinstance(sizes, list) and all(map(_is_size, sizes)), "a list of whole numbers above 0"),
         ("activation", stored["activation"] == "tanh", "'tanh'"),
         ("observation", _are_parts(parts, stored["observation_size"]), "[numbers, what they are] for all of it"),
-        *((n, _are_bounds(stored[n], stored["action_size"]), "a number for each action") for n in _SINCE[1:]),
+        *((n, _are_bounds(stored[n], stored["action_size"]), "a number for each action") for n in _SHOWN[1:]),
+        *((n, _are_texts(stored[n]), "a list of texts") for n in _MADE),
         # These say where it comes from and mean nothing to its use.
         *(
             (n, isinstance(stored[n], int | float | str | None), "a number")
@@ -224,6 +237,7 @@ def _info(stored: Any, path: Path) -> PolicyInfo:
         if not sound:
             raise RunDirectoryError(f"{path}: {name}: expected {expected}, got {brief(stored[name])}")
     tuples = {name: stored[name] and tuple(stored[name]) for name in ("action_low", "action_high")}
+    tuples |= {name: tuple(stored[name]) for name in _MADE}
     tuples |= {"hidden": tuple(sizes), "observation": parts and tuple(map(tuple, parts))}
     return PolicyInfo(**{**stored, **tuples})
 
@@ -234,6 +248,10 @@ def _are_parts(parts: Any, size: int) -> bool:
     pairs = isinstance(parts, list) and all(isinstance(part, list) and len(part) == 2 for part in parts)
     sound = pairs and all(_is_size(number) and isinstance(text, str) for number, text in parts)
     return sound and sum(number for number, _ in parts) == size
+
+
+def _are_texts(texts: Any) -> bool:
+    return isinstance(texts, list) and all(isinstance(text, str) for text in texts)
 
 
 def _are_bounds(bounds: Any, size: int) -> bool:

@@ -16,10 +16,11 @@ from metrpo.config import Config, Preset, System, flatten
 from metrpo.errors import ConfigError
 from metrpo.launch.grid import flat, seeds_of
 from metrpo.launch.run_spec import RunSpec
-from metrpo.presets import override, preset
+from metrpo.presets import configured, override
 from metrpo.run.metrics import Row, numbers
 from metrpo.tune.space import Span, span
 from metrpo.world.registry import get_task
+from metrpo.world.task import Task
 
 if TYPE_CHECKING:
     pass
@@ -79,17 +80,20 @@ class Search:
                 "collect.steps: expected iterations of one length, for pruning compares trials after as many of them, "
                 "got it among what is searched; add --pruner none, and --real-steps, so that all cost the same"
             )
-        object.__setattr__(self, "task", get_task(self.task).name)
+        object.__setattr__(self, "task", self._task().name)
         for name, over in self.space.items():
             for value in over.outermost:
                 override(self.base, {name: value})
         for end in (0, -1):
             override(self.base, {name: over.outermost[end] for name, over in self.space.items()})
 
+    def _task(self) -> Task:
+        return get_task(self.task, self.settings.get("env_kwargs", ()), self.settings.get("imports", ()))
+
     @property
     def base(self) -> Config:
         """The settings that every run starts from."""
-        return override(preset(self.task, self.preset, self.system), dict(self._fixed))
+        return configured(self.task, self.preset, self.system, dict(self._fixed))
 
     @property
     def _fixed(self) -> tuple[tuple[str, Any], ...]:

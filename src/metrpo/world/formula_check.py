@@ -13,7 +13,10 @@ STEPS = 1000
 """Real steps that the check takes, with random actions."""
 TOLERANCE = 1e-3
 """Of 1 + |reward|: states are kept in float32."""
-_ADVICE = "Correct it, leave it out (it is then learned), or go on all the same with --trust-reward"
+_ADVICE = (
+    "Correct it, leave it out or put it aside with --learn-reward (it is then learned), or go on all the same with "
+    "--trust-reward"
+)
 
 
 def check_formulas(task: Task, rng: np.random.Generator) -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+from collections.abc import Iterable, Mapping
 from functools import cache
+from typing import Any
 
 import gymnasium
 
 from metrpo.config import Config
+from metrpo.config.env_kwargs import canonical
 from metrpo.errors import TaskError
 from metrpo.world.interface import with_positions
-from metrpo.world.resolve import resolve, task_of
+from metrpo.world.resolve import import_module, require_no_kwargs, resolve, task_of, with_kwargs
 from metrpo.world.task import Task
 from metrpo.world.tasks.gymnasium_formulas import KNOWN
 
@@ -29,16 +32,22 @@ def tasks() -> dict[str, Task]:
     return dict(_TASKS)
 
 
-def get_task(name: str) -> Task:
+def get_task(name: str, env_kwargs: Iterable[str] | Mapping[str, Any] = (), imports: Iterable[str] = ()) -> Task:
     """The task of that name: a registered one (case does not matter), one that comes with its formulas
     (`metrpo.world.tasks.gymnasium_formulas`), or what `metrpo.world.resolve` makes of it.
 
+    Its environment is made with `env_kwargs`, a dict or texts KEY=VALUE; `imports` are modules that are imported first.
+
     Raises `TaskError` with the nearest names when there is none, and when an environment cannot be used.
     """
+    for module in imports:
+        import_module(module)
+    given = canonical(env_kwargs)
     by_lower = {known.lower(): task for known, task in _TASKS.items()}
     if name.lower() in by_lower:
+        require_no_kwargs(name, given)
         return by_lower[name.lower()]
-    found = _with_formulas(name) if name in KNOWN else resolve(name)
+    found = _with_formulas(name, given) if name in KNOWN else resolve(name, env_kwargs=given)
     if found is not None:
         return found
     original = {known.lower(): known for known in (*_TASKS, *KNOWN, *gymnasium.registry)}
@@ -56,7 +65,7 @@ def task_for(config: Config) -> Task:
 
     Raises `TaskError` as `get_task`.
     """
-    task = get_task(config.task)
+    task = get_task(config.task, config.env_kwargs, config.imports)
     return without_formulas(task) if config.learn_reward else task
 
 
@@ -67,10 +76,10 @@ def without_formulas(task: Task) -> Task:
 
 
 @cache
-def _with_formulas(name: str) -> Task:
+def _with_formulas(name: str, env_kwargs: tuple[str, ...]) -> Task:
     known = KNOWN[name]
     task = task_of(
-        known.make,
+        with_kwargs(known.make, env_kwargs),
         known.reward,
         known.terminated,
         name=name,

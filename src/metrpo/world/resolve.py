@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import gymnasium
 
+from metrpo.config.env_kwargs import keywords
 from metrpo.errors import MissingTaskError, TaskError
 from metrpo.types import Array
 from metrpo.world import env_returns, interface
@@ -76,14 +77,19 @@ def _make(env: str | MakeEnv, name: str, horizon: int | None, **kwargs: Any) -> 
     return Guarded(made, name, horizon)
 
 
-_PLACES: dict[str, Task] = {}
-"""What a name stands for in this process, where that is not what it says."""
+_PLACES: dict[tuple[str, tuple[str, ...]], Task] = {}
+"""What a name stands for in this process, where that is not what it says, by the keyword arguments that go with it."""
 
 
-def place(name: str, task: Task) -> Task:
-    """From here on `name` stands for `task`, which is returned under that name."""
-    _PLACES[name] = dataclasses.replace(task, name=name)
-    return _PLACES[name]
+def place(name: str, task: Task, env_kwargs: tuple[str, ...] = ()) -> Task:
+    """From here on `name`, with these keyword arguments, stands for `task`, which is returned under that name."""
+    _PLACES[name, env_kwargs] = dataclasses.replace(task, name=name)
+    return _PLACES[name, env_kwargs]
+
+
+def is_placed(name: str, env_kwargs: tuple[str, ...] = ()) -> bool:
+    """Whether `place` has been told what that name stands for."""
+    return (name, env_kwargs) in _PLACES
 
 
 def file_of(name: str) -> Path | None:
@@ -104,8 +110,13 @@ def folder_of(name: str) -> Path | None:
     None for any other name, and for what is installed, which every folder finds.
     """
     module = module_of(name)
-    file = getattr(sys.modules.get(module or ""), "__file__", None)
-    if module is None or not isinstance(file, str):
+    return None if module is None else folder_of_module(module)
+
+
+def folder_of_module(module: str) -> Path | None:
+    """The folder, absolute, in which Python has found an imported module; None for what is installed."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    if not isinstance(file, str):
         return None
     found = Path(file).resolve().parents[module.count(".") + (Path(file).stem == "__init__")]
     return None if {"site-packages", "dist-packages"} & set(found.parts) else found
@@ -113,46 +124,83 @@ def folder_of(name: str) -> Path | None:
 
 def is_in(folder: Path, name: str) -> bool:
     """Whether the module of the task module:name lies in `folder`."""
-    path = folder.joinpath(*(module_of(name) or "").split("."))
-    return module_of(name) is not None and (path.with_suffix(".py").is_file() or (path / "__init__.py").is_file())
+    module = module_of(name)
+    return module is not None and holds_module(folder, module)
 
 
-def resolve(name: str, folder: Path | None = None) -> Task | None:
+def holds_module(folder: Path, module: str) -> bool:
+    """Whether a module of that name lies in `folder`."""
+    path = folder.joinpath(*module.split("."))
+    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
+
+
+def import_module(module: str, folder: Path | None = None) -> None:
+    """Imports a module that registers environments; `folder` (default: the current one) is searched first.
+
+    Raises `TaskError` when that fails, `MissingTaskError` when there is no such module.
+    """
+    _import(module, f"imports {module}", folder)
+
+
+def resolve(name: str, folder: Path | None = None, env_kwargs: tuple[str, ...] = ()) -> Task | None:
     """The task that `name` stands for: an id, or `module:name` or `file.py:name` of a task, of what makes an
     environment, or of an id that the module registers.
 
-    `folder` (default: the current one) is searched for modules first. None when it is neither; the same object every
-    time. Raises `TaskError` when it is one and cannot be used, `MissingTaskError` when there is no such file or module.
+    `folder` (default: the current one) is searched for modules first. Its environment is made with `env_kwargs`
+    (`config.env_kwargs`). None when it is neither; the same object every time. Raises `TaskError` when it is one and
+    cannot be used, `MissingTaskError` when there is no such file or module.
     """
-    if name in _PLACES:
-        return _PLACES[name]
+    if is_placed(name, env_kwargs):
+        return _PLACES[name, env_kwargs]
     if module_of(name) is not None:
-        return _resolve(name, name, folder or Path.cwd())
+        return _resolve(name, name, folder or Path.cwd(), env_kwargs)
     file = file_of(name)
-    return _resolve(name, name if file is None else f"{file}:{name.rpartition(':')[2]}")
+    return _resolve(name, name if file is None else f"{file}:{name.rpartition(':')[2]}", None, env_kwargs)
 
 
 @cache
-def _resolve(name: str, where: str, folder: Path | None = None) -> Task | None:
+def _resolve(name: str, where: str, folder: Path | None, env_kwargs: tuple[str, ...]) -> Task | None:
     if where.startswith("dm_control/"):
         _register_dm_control()
         if where in gymnasium.registry:
-            return task_of(where, name=name, horizon=_DM_CONTROL_STEPS)
+            return task_of(with_kwargs(where, env_kwargs), name=name, horizon=_DM_CONTROL_STEPS)
     if where in gymnasium.registry:
-        return task_of(where, name=name)
+        return task_of(with_kwargs(where, env_kwargs), name=name)
     module, colon, attribute = where.rpartition(":")
     if not colon:
         return None
     value = getattr(_import(module, name, folder), attribute, None)
     if value is None and attribute in gymnasium.registry:
-        return task_of(attribute, name=name)
+        return task_of(with_kwargs(attribute, env_kwargs), name=name)
     if value is None:
         raise TaskError(f"{name}: {module} has no {attribute!r}, nor registers it; define it there, or name another")
     if isinstance(value, Task):
+        require_no_kwargs(name, env_kwargs)
         return dataclasses.replace(value, name=name)
     if callable(value):
-        return task_of(value, name=name)
+        return task_of(with_kwargs(value, env_kwargs), name=name)
     raise TaskError(f"{name}: expected a metrpo.Task or a function that makes an environment, got {value!r}")
+
+
+def with_kwargs(env: str | MakeEnv, env_kwargs: tuple[str, ...]) -> str | MakeEnv:
+    """An id, or a function that makes an environment, with keyword arguments; those of a call win."""
+    given = keywords(env_kwargs)
+    if not given:
+        return env
+    return (
+        partial(gymnasium.make, env, **{"disable_env_checker": True, **given})
+        if isinstance(env, str)
+        else partial(env, **given)
+    )
+
+
+def require_no_kwargs(name: str, env_kwargs: tuple[str, ...]) -> None:
+    """Raises `TaskError` where keyword arguments are given to what is made already."""
+    if env_kwargs:
+        raise TaskError(
+            f"{name}: expected no env_kwargs, got {', '.join(env_kwargs)}: its environment is made already; "
+            "leave them out, or name a function that takes them and makes an environment"
+        )
 
 
 def _import(module: str, name: str, folder: Path | None) -> Any:
