@@ -86,6 +86,8 @@ OURS = {
     "preset": ("paper", "the label"),
     "seed": (0, "any will do"),
     "data": (None, "nothing is logged elsewhere"),
+    "max_action": (1.0, "the environment's range is the only limit"),
+    "max_change": (None, "the paper knows none: off"),
     "env_kwargs": ((), "the paper's tasks take none"),
     "imports": ((), "the paper's tasks are our own"),
     "real_steps": (None, "the budget is given in iterations"),

@@ -27,8 +27,7 @@ class Arm:
     def sense(self):
         return np.array([np.cos(self.angle), np.sin(self.angle), self.speed / 5])
 
-    def move(self, action):
-        torque = 4 * float(action[0])
+    def move(self, torque):
         self.speed += DT * (9.81 / 0.5 * np.sin(self.angle) + (torque - 0.1 * self.speed) / 0.25)
         self.speed = np.clip(self.speed, -15, 15)
         self.angle += DT * self.speed
@@ -37,11 +36,12 @@ class Arm:
 
 def play(policy, noise, rng):
     """One episode: states [61, 3], actions [60, 1], rewards [60]."""
+    policy.reset()
     arm = Arm(rng)
     states, actions, rewards = [arm.sense()], [], []
     for _ in range(STEPS):
-        action = np.clip(policy(states[-1]) + noise * rng.standard_normal(1), -1, 1)
-        rewards.append(arm.move(action))
+        action = policy.limited(policy.unlimited(states[-1]) + noise * rng.standard_normal(1))
+        rewards.append(arm.move(float(policy.to_env(action)[0])))
         actions.append(action)
         states.append(arm.sense())
     return states, actions, rewards

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from metrpo.run.metrics import read_metrics
     from metrpo.run.policy_file import LoadedPolicy, load_policy
     from metrpo.training import init, step, train
+    from metrpo.world.interface import Interface
     from metrpo.world.registry import get_task, tasks
     from metrpo.world.resolve import task_of
     from metrpo.world.task import Task
@@ -33,6 +34,7 @@ __all__ = [
     "Config",
     "ConfigError",
     "EvaluationResult",
+    "Interface",
     "LoadedPolicy",
     "MetrpoError",
     "RunDirectoryError",
@@ -62,6 +64,7 @@ _HOME = {
     "metrpo.run.metrics": ("read_metrics",),
     "metrpo.run.policy_file": ("LoadedPolicy", "load_policy"),
     "metrpo.training": ("init", "step", "train"),
+    "metrpo.world.interface": ("Interface",),
     "metrpo.world.resolve": ("task_of",),
     "metrpo.world.registry": ("get_task", "tasks"),
     "metrpo.world.task": ("Task",),

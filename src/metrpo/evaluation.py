@@ -11,12 +11,13 @@ import numpy as np
 
 from metrpo.counting import counted
 from metrpo.errors import ConfigError, TaskError
+from metrpo.limits import Limits
 from metrpo.run.policy_file import LoadedPolicy, PolicyInfo, load_policy
 from metrpo.run.task_file import task_of_run
 from metrpo.run.video import record
 from metrpo.safe_load import brief
 from metrpo.world import collect
-from metrpo.world.registry import get_task
+from metrpo.world.registry import get_task, limited
 from metrpo.world.task import Task
 
 
@@ -81,6 +82,7 @@ def evaluate(
         known = of_run or get_task(made.task, made.env_kwargs, made.imports)
     if isinstance(act, LoadedPolicy):
         _require_fit(act, known)
+        known, act = limited(known, Limits.of(act.info)), act.unlimited
     return EvaluationResult(known.name, seed, collect.evaluate(known, act, episodes, seed))
 
 
@@ -96,6 +98,7 @@ def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0, ta
     policy = load_policy(run_dir)
     known = task_of_run(run_dir, policy.info) if task is None else _task_at(task, policy.info)
     _require_fit(policy, known)
+    policy.reset()
     return record(known.make_env, policy, Path(out or Path(run_dir) / "video.mp4"), seed)
 
 

@@ -154,6 +154,7 @@ def simulator_of(config: Config, task: Task, ensemble: Ensemble, inputs: Inputs 
         disagreement=config.imagine.disagreement,
         cut=horizon < task.horizon,
         inputs=inputs,
+        limits=task.limits,
     )
 
 

@@ -22,6 +22,7 @@ from metrpo.config import Config
 from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import ConfigError, MetrpoError
 from metrpo.finite import require_finite
+from metrpo.limits import NONE, Limits
 from metrpo.run import task_file
 from metrpo.run.directory import RunDirectory, Saved
 from metrpo.run.memory import require_memory
@@ -45,6 +46,8 @@ METHODS = {
     "ddpg": "metrpo.baselines.stable_baselines",
 }
 """Modules with `init` and `step`; imported when used, for some need libraries of their own."""
+_LIMITED = ("model-based", "trpo")
+"""Methods whose real steps are all played by `world.collect` and learned from as they were executed."""
 
 
 def init(config: Config) -> Saved:
@@ -59,6 +62,9 @@ def init(config: Config) -> Saved:
 def _init(config: Config, task: Task) -> Saved:
     if config.method != "model-based" and (config.data is not None or config.real_steps == 0):
         raise ConfigError(f"data: only the method model-based learns from logged transitions, got {config.method}")
+    if config.method not in _LIMITED and Limits.of(config) != NONE:
+        limit = "max_action" if config.max_action < 1 else "max_change"
+        raise ConfigError(f"{limit}: only {' and '.join(_LIMITED)} learn under limits, got the method {config.method}")
     require_memory(config, task)
     state: Saved = import_module(METHODS[config.method]).init(config, task)
     return state

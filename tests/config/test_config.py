@@ -109,6 +109,8 @@ IMPOSSIBLE = {
     "iterations": [0, -3],
     "real_steps": [-1],
     "evaluation_episodes": [0],
+    "max_action": [0.0, 1.5, float("nan")],
+    "max_change": [0.0, -0.1, float("inf")],
     "collect.steps": [0],
     "collect.max_std": [-0.1, float("inf"), float("nan")],
     "collect.parameter_noise": [-1.0, float("nan")],

@@ -364,6 +364,11 @@ class Config:
     """Learn the reward and the end of episodes even where the task has formulas for them."""
     trust_reward: bool = False
     """Do not first hold the formulas of a task of your own against 1,000 (uncounted) real steps."""
+    max_action: float = 1.0
+    """Actions stay within plus and minus this, in the policy's units: 1 is the end of the environment's range."""
+    max_change: float | None = None
+    """Most that an action changes from one step to the next, in the same units; from the middle of the range at the
+    start of an episode. Whoever plays the policy's file is held to both. None: any."""
     evaluation_episodes: int = 20
     """Real episodes of the deterministic policy that `return_real` averages; a report, never used to learn."""
     deterministic: bool = False
@@ -388,6 +393,9 @@ class Config:
         require(0 <= self.seed < 2**31, "seed", self.seed, "between 0 and 2^31 - 1")
         require(self.iterations >= 1, "iterations", self.iterations, "at least 1")
         require(self.real_steps is None or self.real_steps >= 0, "real_steps", self.real_steps, "at least 0")
+        require(0 < self.max_action <= 1, "max_action", self.max_action, "above 0 and at most 1")
+        change = self.max_change
+        require(change is None or positive(change), "max_change", change, "a finite number > 0")
         require(self.evaluation_episodes >= 1, "evaluation_episodes", self.evaluation_episodes, "at least 1")
 
 

@@ -38,6 +38,8 @@ ADDED = (
     "config.data",
     "config.env_kwargs",
     "config.imports",
+    "config.max_action",
+    "config.max_change",
     "config.learn_reward",
     "config.trust_reward",
 )

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Bool, Float, Key
 
 from metrpo.devices import across, is_spread, share_of, sharers
+from metrpo.limits import NONE, Limits
 from metrpo.model.ensemble import Ensemble, Predictor, predict, predict_delta
 from metrpo.model.model_parallel import can_share, shared
 from metrpo.model.sampling import SAMPLINGS, Keys, for_all
@@ -31,10 +32,10 @@ core alone reads more than it computes: the cores of a CPU then share the models
 (docs/performance.md, "Models shared by the cores")."""
 
 
-_Going = tuple[Float[Array, "N S"], Float[Array, "N"], Bool[Array, "N"]]
-"""Of imagined episodes: states, 1 where they go on, and which have diverged."""
-_Valued = tuple[Float[Array, "K N S"], Float[Array, "K N"], Float[Array, "K N"]]
-"""Of episodes in each model: states, 1 where they go on, and the return so far."""
+_Going = tuple[Float[Array, "N S"], Float[Array, "N"], Bool[Array, "N"], Float[Array, "N A"] | None]
+"""Of imagined episodes: states, 1 where they go on, which have diverged, and the last actions, where they matter."""
+_Valued = tuple[Float[Array, "K N S"], Float[Array, "K N"], Float[Array, "K N"], Float[Array, "K N A"] | None]
+"""Of episodes in each model: states, 1 where they go on, the return so far, and the last actions, where they matter."""
 
 
 @jax.tree_util.register_dataclass
@@ -58,6 +59,13 @@ class Simulator:
     """Whether its episodes end before the task's do, and are valued there."""
     inputs: Inputs | None = None
     """How the policy sees the states; None: as they are."""
+    limits: Limits = field(default=NONE, metadata={"static": True})
+    """What its actions are held to."""
+
+    def nothing_before(self, *rows: int) -> Array | None:
+        """The actions before the first step, [*rows, A]; None where they do not matter."""
+        size = self.ensemble.normaliser.action_mean.shape[-1]
+        return None if self.limits.max_change is None else jnp.zeros((*rows, size))
 
 
 class ImagineInfo(NamedTuple):
@@ -103,9 +111,9 @@ def imagine(
 ) -> tuple[Trajectories, ImagineInfo]:
     """Imagined episodes from `starts`, in which `act` sees the states as they are.
 
-    Actions are clipped to [-1, 1] for dynamics and reward, and recorded as drawn. Where devices share the batch
-    (`devices.spread`), the trajectories are this device's, and the info is about all. A CPU's devices share the models
-    too, where these are too wide for a core.
+    Actions are held to the limits, [-1, 1] or less, for dynamics and reward, and recorded as drawn. Where devices share
+    the batch (`devices.spread`), the trajectories are this device's, and the info is about all. A CPU's devices share
+    the models too, where these are too wide for a core.
     """
     rows, horizon, bonus = starts.shape[0], simulator.horizon, simulator.disagreement
     sampling = SAMPLINGS[simulator.sampling]
@@ -116,10 +124,10 @@ def imagine(
     episode_key = jax.random.fold_in(key, horizon)
 
     def step(carry: _Going, key: Key[Array, ""]) -> tuple[_Going, Trajectories]:
-        states, alive, diverged = carry
+        states, alive, diverged, before = carry
         action_key, model_key = jax.random.split(key)
         actions = act(states, action_key)
-        clipped = jnp.clip(actions, -1.0, 1.0)
+        clipped = simulator.limits.within(actions, before)
         predicted = sampling.draw(models, states, clipped, Keys(model_key, episode_key))
         following, rewards, ended = outcome(simulator.reward, simulator.terminated, states, clipped, predicted)
         if bonus:
@@ -131,10 +139,10 @@ def imagine(
             alive = alive * (1.0 - ended)
         # A diverged rollout stands still, so that it stays finite; it is masked below.
         following = jnp.where(bad[:, None], states, following)
-        return (following, alive, diverged), recorded
+        return (following, alive, diverged, None if before is None else clipped), recorded
 
-    carry = (starts, jnp.ones(rows), jnp.zeros(rows, bool))
-    (last, alive, diverged), trajectories = jax.lax.scan(step, carry, jax.random.split(key, horizon))
+    carry = (starts, jnp.ones(rows), jnp.zeros(rows, bool), simulator.nothing_before(rows))
+    (last, alive, diverged, _), trajectories = jax.lax.scan(step, carry, jax.random.split(key, horizon))
     mask = trajectories.mask * (1.0 - diverged)
     total, lost, rollouts, steps = across(
         (jnp.sum(trajectories.rewards * mask), jnp.sum(diverged), jnp.float32(rows), jnp.sum(mask))
@@ -173,8 +181,8 @@ def returns_per_model(
     ensemble, horizon, bonus = simulator.ensemble, simulator.horizon, simulator.disagreement
 
     def step(carry: _Valued, weight: Float[Array, ""]) -> tuple[_Valued, None]:
-        states, alive, total = carry
-        actions = jnp.clip(act(states), -1.0, 1.0)
+        states, alive, total, before = carry
+        actions = simulator.limits.within(act(states), before)
         predicted = predict(ensemble, states, actions)
         following, rewards, ended = outcome(simulator.reward, simulator.terminated, states, actions, predicted)
         if bonus:
@@ -185,12 +193,13 @@ def returns_per_model(
         total = total + jnp.where(alive > 0, jnp.where(sound, weight * rewards, jnp.nan), 0.0)
         if ended is not None:
             alive = alive * (1.0 - ended)
-        return (following, alive, total), None
+        return (following, alive, total, None if before is None else actions), None
 
     states = for_all(ensemble, starts)
     zeros = jnp.zeros(states.shape[:2])
     weights = jnp.float32(discount) ** jnp.arange(horizon)
-    (states, alive, total), _ = jax.lax.scan(step, (states, zeros + 1.0, zeros), weights)
+    carry = (states, zeros + 1.0, zeros, simulator.nothing_before(*zeros.shape))
+    (states, alive, total, _), _ = jax.lax.scan(step, carry, weights)
     if after is not None:
         total = total + jnp.where(alive > 0, discount**horizon * after(states), 0.0)
     return jnp.mean(total, axis=1)

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from metrpo.errors import MetrpoError, RunDirectoryError
+from metrpo.limits import Limits
 from metrpo.run.files import atomic_write, metrpo_version
 from metrpo.run.policy_file import FILE, LoadedPolicy, load_policy, with_interface
 from metrpo.safe_load import opened
@@ -110,6 +111,7 @@ def _python(policy: LoadedPolicy, source: Path) -> str:
         "info_literal": "{\n" + "".join(f"    {name!a}: {_literal(value)},\n" for name, value in info.items()) + "}",
         "layout": _layout(info["observation"]),
         "range": _range(info),
+        "limits": _limits(info),
         "sha256": hashlib.sha256(weights).hexdigest(),
         "weights": "\n".join(textwrap.wrap(base64.b64encode(weights).decode(), 100)),
         "example": _numbers(example, 17),
@@ -145,6 +147,12 @@ def _range(info: dict[str, Any]) -> str:
     return f"    ACTION_LOW   {low}\n    ACTION_HIGH  {high}"
 
 
+def _limits(info: dict[str, Any]) -> str:
+    largest = f"actions within plus and minus {info['max_action']:g}"
+    change = info["max_change"]
+    return f"{largest}{'' if change is None else f', that change by at most {change:g} a step (see reset)'}."
+
+
 def _inside_docstring(value: Any) -> str:
     # ascii() leaves whole escapes and printable characters, of which only double quotes could end the docstring.
     return ascii(str(value))[1:-1].replace('"', '\\"')
@@ -159,7 +167,8 @@ def _onnx(policy: LoadedPolicy, source: Path) -> bytes:
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
         raise MetrpoError("no package onnx: pip install 'metrpo[export]', or choose a .py or .npz") from error
-    constants = {"low": np.asarray(-1.0), "high": np.asarray(1.0)}
+    limits = Limits.of(policy.info)
+    constants = {"low": np.asarray(-limits.max_action), "high": np.asarray(limits.max_action)}
     nodes, value, kind = [], "observation", TensorProto.FLOAT
     if policy.origin is not None:
         kind, value = TensorProto.DOUBLE, "relative"
@@ -172,6 +181,15 @@ def _onnx(policy: LoadedPolicy, source: Path) -> bytes:
         nodes.append(helper.make_node("Gemm", [value, f"w{i}", f"b{i}"], [f"sum{i}"]))
         nodes.append(helper.make_node("Tanh", [f"sum{i}"], [value := f"hidden{i}"]))
     nodes[-1] = helper.make_node("Clip", [f"sum{len(policy.layers) - 1}", "low", "high"], ["action"])
+    if limits.max_change is not None:
+        constants["most"] = np.asarray(limits.max_change)
+        nodes[-1].output[0] = "wanted"
+        nodes += [
+            helper.make_node("Sub", ["previous_action", "most"], ["least"]),
+            helper.make_node("Add", ["previous_action", "most"], ["largest"]),
+            helper.make_node("Max", ["wanted", "least"], ["raised"]),
+            helper.make_node("Min", ["raised", "largest"], ["action"]),
+        ]
 
     def end(name: str, kind: int, size: int, text: str) -> Any:
         return helper.make_tensor_value_info(name, kind, ["batch", size], doc_string=text)
@@ -183,7 +201,11 @@ def _onnx(policy: LoadedPolicy, source: Path) -> bytes:
     tensors = [numpy_helper.from_array(array.astype(np.float32), name) for name, array in constants.items()]
     if policy.origin is not None:
         tensors.append(numpy_helper.from_array(policy.origin, "origin"))
-    graph = helper.make_graph(nodes, "policy", [observation], [action], tensors, doc_string="A tanh network, clipped.")
+    inputs = [observation]
+    if limits.max_change is not None:
+        text = "The action of the step before; 0 in an episode's first."
+        inputs.append(end("previous_action", TensorProto.FLOAT, len(policy.layers[-1][1]), text))
+    graph = helper.make_graph(nodes, "policy", inputs, [action], tensors, doc_string="A tanh network, clipped.")
     info = {name: _utf8(value) for name, value in _info(policy, source).items()}
     text = f"A policy for {info['task']}: observation [batch, S] to action [batch, A], float32."
     if policy.origin is not None:
@@ -211,7 +233,7 @@ _RELATIVE = """\
 _SOURCE = '''\
 """A trained control policy in one file: observations in, actions out. It needs NumPy and nothing else.
 
-    from policy import act, control  # or whatever this file is called
+    from policy import act, control, reset  # or whatever this file is called
     action = act(observation)  # [S] -> [A] or [B, S] -> [B, A], float32, each action in [-1, 1]
     action = control(observation)  # the same in the environment's own units, within its bounds
 
@@ -220,6 +242,7 @@ Its observations, which may hold more than the plain environment shows:
 $layout
 Its own range of actions, for which -1 and 1 stand:
 $range
+Its limits: $limits
 
 Written by metrpo $metrpo from a policy.npz with SHA-256
 $policy_sha256,
@@ -238,10 +261,21 @@ INFO = $info_literal
 OBSERVATION = INFO["observation"]
 ACTION_LOW = INFO["action_low"]
 ACTION_HIGH = INFO["action_high"]
+MAX_ACTION = INFO["max_action"]
+MAX_CHANGE = INFO["max_change"]
+_last = {}
+
+
+def reset():
+    """Begins an episode: MAX_CHANGE counts from 0, the middle of the range of actions."""
+    _last.clear()
 
 
 def act(observation):
-    """The action, in [-1, 1], float32: [S] -> [A] or [B, S] -> [B, A]; ValueError for other shapes, NaN or infinity."""
+    """The action, in [-1, 1], float32: [S] -> [A] or [B, S] -> [B, A]; ValueError for other shapes, NaN or infinity.
+
+    Within the limits: call it once a step, and reset() before each episode, where there is a MAX_CHANGE.
+    """
     with np.errstate(over="ignore"):
         hidden = np.asarray(observation, dtype=np.$dtype)
     if hidden.ndim not in (1, 2) or hidden.shape[-1] != OBSERVATION_SIZE:
@@ -253,7 +287,19 @@ $relative    if not np.isfinite(hidden).all():
     for weights, bias in _LAYERS[:-1]:
         hidden = np.tanh(hidden @ weights + bias)
     weights, bias = _LAYERS[-1]
-    return np.clip(hidden @ weights + bias, -1.0, 1.0)
+    return limited(np.clip(hidden @ weights + bias, -1.0, 1.0))
+
+
+def limited(action):
+    """An action, such as one of your own, within MAX_ACTION and MAX_CHANGE; it is the last one from then on."""
+    action = np.clip(np.asarray(action, dtype=np.float32), -MAX_ACTION, MAX_ACTION)
+    if MAX_CHANGE is None:
+        return action
+    before = _last.get("action", np.zeros_like(action))
+    if before.shape != action.shape:
+        raise ValueError(f"action: expected shape {list(before.shape)} as in the step before: call reset() first")
+    _last["action"] = np.clip(action, before - MAX_CHANGE, before + MAX_CHANGE).astype(np.float32)
+    return _last["action"]
 
 
 def to_env(action):

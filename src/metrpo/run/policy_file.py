@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Protocol
@@ -14,6 +14,7 @@ import numpy as np
 
 from metrpo.config import Config
 from metrpo.errors import RunDirectoryError
+from metrpo.limits import Limits
 from metrpo.run.files import FORMAT, atomic_write, inside, metrpo_version, read_arrays, write_arrays
 from metrpo.safe_load import brief
 
@@ -50,6 +51,10 @@ class PolicyInfo:
     """What its environment was made with, each KEY=VALUE (`metrpo.config.env_kwargs`)."""
     imports: tuple[str, ...] = ()
     """Modules that register its environment."""
+    max_action: float = 1.0
+    """Its actions stay within plus and minus this."""
+    max_change: float | None = None
+    """Most that its actions change from one step to the next; None: any."""
 
 
 _MOST = 1e300
@@ -58,7 +63,9 @@ _SHOWN = ("observation", "action_low", "action_high")
 """Fields that say what the environment shows and takes."""
 _MADE = ("env_kwargs", "imports")
 """Fields that say how the environment is made."""
-_SINCE = dict.fromkeys(_SHOWN) | {"env_kwargs": [], "imports": []}
+_LIMITS = ("max_action", "max_change")
+"""Fields that say what its actions are held to."""
+_SINCE = dict.fromkeys(_SHOWN) | {"env_kwargs": [], "imports": [], "max_action": 1.0, "max_change": None}
 """Fields that older policies lack, and what that means."""
 
 
@@ -92,16 +99,46 @@ class Weights(Protocol):
 
 @dataclass(frozen=True)
 class LoadedPolicy:
-    """A deterministic policy: call it with observations, get actions."""
+    """A deterministic policy: call it with observations, get actions.
+
+    Where it has a `max_change`, it remembers its last action: call it once a step, and `reset()` before each episode.
+    """
 
     info: PolicyInfo
     layers: tuple[tuple[np.ndarray, np.ndarray], ...]
     """Weights [in, out] and bias [out] of every layer."""
     origin: np.ndarray | None = None
     """[S], float64: what its observations are counted from, where that is not 0."""
+    _last: dict[str, np.ndarray] = field(default_factory=dict, compare=False, repr=False)
+    """The last action, where the next one must not lie far from it."""
 
     def __call__(self, observation: Any) -> np.ndarray:
-        """The action, in [-1, 1], float32: [S] -> [A] or [B, S] -> [B, A].
+        """The action, within the policy's limits in [-1, 1], float32: [S] -> [A] or [B, S] -> [B, A].
+
+        Raises `ValueError` as `unlimited` and `limited`.
+        """
+        return self.limited(self.unlimited(observation))
+
+    def reset(self) -> None:
+        """Begins an episode: `max_change` counts from 0, the middle of the range of actions."""
+        self._last.clear()
+
+    def limited(self, action: Any) -> np.ndarray:
+        """An action [A] or [B, A], such as `unlimited` gives and with noise of one's own, within the policy's limits.
+
+        Remembers it as the last one. Raises `ValueError` when the one before was for other robots: of another shape.
+        """
+        given, before = np.asarray(action, np.float32), self._last.get("action")
+        if before is not None and before.shape != given.shape:
+            expected, got = list(before.shape), list(given.shape)
+            raise ValueError(f"action: expected shape {expected} as in the step before, got {got}; call reset() first")
+        found = Limits.of(self.info).within(given, before).astype(np.float32)
+        if self.info.max_change is not None:
+            self._last["action"] = found
+        return found
+
+    def unlimited(self, observation: Any) -> np.ndarray:
+        """The action in [-1, 1] before the policy's limits, float32: [S] -> [A] or [B, S] -> [B, A]; keeps nothing.
 
         Raises `ValueError` when the observation has another shape, or is not finite in float32.
         """
@@ -160,7 +197,7 @@ def save_policy(
     info = PolicyInfo(task, layers[0][0].shape[0], layers[-1][0].shape[1], hidden, iteration, real_steps, return_real)
     info = with_interface(info, interface)
     if settings is not None:
-        info = replace(info, **{name: getattr(settings, name) for name in _MADE})
+        info = replace(info, **{name: getattr(settings, name) for name in (*_MADE, *_LIMITS)})
     arrays = {f"{kind}{i}": array for i, layer in enumerate(layers) for kind, array in zip("wb", layer, strict=True)}
     arrays["log_std"] = np.asarray(policy.log_std)
     if origin is not None and origin.any():
@@ -228,6 +265,8 @@ def _info(stored: Any, path: Path) -> PolicyInfo:
         ("observation", _are_parts(parts, stored["observation_size"]), "[numbers, what they are] for all of it"),
         *((n, _are_bounds(stored[n], stored["action_size"]), "a number for each action") for n in _SHOWN[1:]),
         *((n, _are_texts(stored[n]), "a list of texts") for n in _MADE),
+        ("max_action", _is_share(stored["max_action"]), "a number above 0 and at most 1"),
+        ("max_change", stored["max_change"] is None or _is_positive(stored["max_change"]), "a number above 0"),
         # These say where it comes from and mean nothing to its use.
         *(
             (n, isinstance(stored[n], int | float | str | None), "a number")
@@ -248,6 +287,14 @@ def _are_parts(parts: Any, size: int) -> bool:
     pairs = isinstance(parts, list) and all(isinstance(part, list) and len(part) == 2 for part in parts)
     sound = pairs and all(_is_size(number) and isinstance(text, str) for number, text in parts)
     return sound and sum(number for number, _ in parts) == size
+
+
+def _is_positive(value: Any) -> bool:
+    return type(value) in (int, float) and 0 < value <= _MOST
+
+
+def _is_share(value: Any) -> bool:
+    return _is_positive(value) and value <= 1
 
 
 def _are_texts(texts: Any) -> bool:

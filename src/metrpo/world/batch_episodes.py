@@ -164,7 +164,7 @@ def _advance(task: Task, slots: SideBySide, running: dict[int, _Running], act: A
     if actions.shape != (len(now), task.action_size) or np.isnan(actions).any():
         for action, step in zip(actions, steps, strict=True):
             collect.action_of(task, action, f"step {step} of an episode")  # raises
-    actions = np.clip(actions, -1.0, 1.0).astype(np.float32)
+    actions = task.limits.within(actions, _before(task, now)).astype(np.float32)
     got = slots.step(order, actions, steps)
     for i, r in enumerate(now):
         r.states.append(got.states[i])
@@ -172,6 +172,13 @@ def _advance(task: Task, slots: SideBySide, running: dict[int, _Running], act: A
         r.rewards.append(float(got.rewards[i]))
     over = got.terminated | (steps + 1 >= np.array([r.longest for r in now]))
     return [(slot, bool(got.terminated[i])) for i, slot in enumerate(order) if over[i]]
+
+
+def _before(task: Task, now: list[_Running]) -> np.ndarray | None:
+    """The last actions of the episodes under way, [n, A]; None where they do not matter."""
+    if task.limits.max_change is None:
+        return None
+    return np.array([r.actions[-1] if r.actions else np.zeros(task.action_size, np.float32) for r in now])
 
 
 def evaluate(

@@ -163,12 +163,13 @@ def _episode(
     state = _start(task, env, seed)
     states, rewards = [state], list[float]()
     actions: list[np.ndarray] = []
+    before: np.ndarray | None = None
     terminated = truncated = False
     longest = task.horizon if longest is None else min(longest, task.horizon)
     while not (terminated or truncated) and len(actions) < longest:
         on_step()
         where = f"step {len(actions)} of an episode"
-        action = action_of(task, act(state), where)
+        action = before = action_of(task, act(state), where, before)
         with _of_episode(f" (at {where})"):
             observation, reward, terminated, truncated, _ = env_returns.after_step(task.name, partial(env.step, action))
         state = _numbers(task, where, observation, reward)
@@ -180,8 +181,8 @@ def _episode(
     )
 
 
-def action_of(task: Task, given: np.ndarray, where: str) -> np.ndarray:
-    """The action [A], within [-1, 1], that a policy of `task` has `given`.
+def action_of(task: Task, given: np.ndarray, where: str, before: np.ndarray | None = None) -> np.ndarray:
+    """The action [A], within the task's limits, that a policy of `task` has `given` after the action `before`.
 
     Raises `TaskError` when its size is another than the task's, `DivergedError` when it holds NaN.
     """
@@ -192,7 +193,7 @@ def action_of(task: Task, given: np.ndarray, where: str) -> np.ndarray:
             f"{task.name}: {where}: expected an action of {counted(task.action_size, 'number')}, got {got}; use a "
             "policy that was made for this task"
         )
-    action = np.clip(array, -1.0, 1.0).astype(np.float32).reshape(task.action_size)
+    action = task.limits.within(array.reshape(task.action_size), before).astype(np.float32)
     if np.isnan(action).any():
         raise DivergedError(
             f"{task.name}: {where}: expected numbers as action, got {action.tolist()}; "

@@ -13,6 +13,7 @@ import gymnasium
 from metrpo.config import Config
 from metrpo.config.env_kwargs import canonical
 from metrpo.errors import TaskError
+from metrpo.limits import Limits
 from metrpo.world.interface import with_positions
 from metrpo.world.resolve import import_module, require_no_kwargs, resolve, task_of, with_kwargs
 from metrpo.world.task import Task
@@ -66,7 +67,13 @@ def task_for(config: Config) -> Task:
     Raises `TaskError` as `get_task`.
     """
     task = get_task(config.task, config.env_kwargs, config.imports)
-    return without_formulas(task) if config.learn_reward else task
+    return limited(without_formulas(task) if config.learn_reward else task, Limits.of(config))
+
+
+@cache
+def limited(task: Task, limits: Limits) -> Task:
+    """The task in which every policy is held to `limits`; the same object every time."""
+    return dataclasses.replace(task, limits=limits)
 
 
 @cache

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import gymnasium
 
 from metrpo.errors import TaskError
+from metrpo.limits import NONE, Limits
 from metrpo.types import Array
 from metrpo.world.env_wrapper import refuse_running_statistics
 from metrpo.world.interface import Interface
@@ -42,6 +43,8 @@ class Task:
     """Makes the environment, in place of `gymnasium.make(env_id)`."""
     interface: Interface | None = None
     """What the environment shows and takes, as a policy's file says it; None: unknown."""
+    limits: Limits = NONE
+    """What actions every policy is held to."""
 
     def __post_init__(self) -> None:
         require_size(self.name, self.state_size)
