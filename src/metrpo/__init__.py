@@ -19,6 +19,8 @@ from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError, TaskError
 
 if TYPE_CHECKING:
     from metrpo.algorithm import State
+    from metrpo.callbacks import Callback
+    from metrpo.console.progress import SILENT
     from metrpo.evaluation import EvaluationResult, evaluate, render
     from metrpo.presets import preset
     from metrpo.run.episodes import append_episode
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
     from metrpo.world.task import Task
 
 __all__ = [
+    "SILENT",
+    "Callback",
     "Config",
     "ConfigError",
     "EvaluationResult",
@@ -58,6 +62,8 @@ __all__ = [
 # Imported at first use: a policy can be loaded without JAX, and `import metrpo` costs next to nothing.
 _HOME = {
     "metrpo.algorithm": ("State",),
+    "metrpo.callbacks": ("Callback",),
+    "metrpo.console.progress": ("SILENT",),
     "metrpo.evaluation": ("EvaluationResult", "evaluate", "render"),
     "metrpo.presets": ("preset",),
     "metrpo.run.episodes": ("append_episode",),
@@ -74,6 +80,8 @@ register_ids_with_gymnasium()
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return importlib.import_module("metrpo.run.files").metrpo_version()
     for module, names in _HOME.items():
         if name in names:
             return getattr(importlib.import_module(module), name)

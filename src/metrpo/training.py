@@ -18,8 +18,9 @@ import numpy as np
 
 from metrpo import budget
 from metrpo.algorithm import Log, Row
+from metrpo.callbacks import Callback, Callbacks
 from metrpo.config import Config
-from metrpo.console.progress import SILENT, Progress
+from metrpo.console.progress import SILENT, Progress, library_progress
 from metrpo.errors import ConfigError, MetrpoError
 from metrpo.finite import require_finite
 from metrpo.limits import NONE, Limits
@@ -28,6 +29,7 @@ from metrpo.run.directory import RunDirectory, Saved
 from metrpo.run.memory import require_memory
 from metrpo.run.yardstick_record import are_kept, keep
 from metrpo.seeds import Stage, rng_of
+from metrpo.stages.log import Unkept
 from metrpo.world.env_returns import warning_once
 from metrpo.world.formula_check import check_formulas
 from metrpo.world.registry import task_for
@@ -86,25 +88,34 @@ def _step(config: Config, task: Task, state: Saved, progress: Progress, log: Log
     return following
 
 
-def train(config: Config, run_dir: str | Path | None = None, progress: Progress = SILENT) -> Saved:
+def train(
+    config: Config,
+    run_dir: str | Path | None = None,
+    progress: Progress | None = None,
+    callbacks: Sequence[Callback] = (),
+) -> Saved:
     """Runs the loop until the budget is spent and returns the last state.
 
     With `run_dir`, every iteration is saved there; a run found there is resumed, exactly as if it had never stopped.
+
+    `progress` is by default shown in a terminal and in a notebook, and not elsewhere; `metrpo.SILENT` shows nothing.
+    `callbacks` hear of rows, episodes and checkpoints (`metrpo.Callback`).
 
     The formulas of a task of the user's own are checked first (`metrpo.world.formula_check`).
 
     Raises `TaskError` for an unknown or broken task and `RunDirectoryError` when `run_dir` cannot be used.
     """
     with warning_once():
-        return _train(config, run_dir, progress)
+        return _train(config, run_dir, library_progress() if progress is None else progress, Callbacks(callbacks))
 
 
-def _train(config: Config, run_dir: str | Path | None, progress: Progress) -> Saved:
+def _train(config: Config, run_dir: str | Path | None, progress: Progress, callbacks: Callbacks) -> Saved:
     task = task_for(config)
     template = _init(config, task)
     if run_dir is None:
         check(config, task)
-        return _loop(config, task, template, progress, lambda state, row: row)
+        callbacks.on_begin(config, None, [])
+        return _loop(config, task, template, progress, lambda state, row: row, callbacks)
     with RunDirectory(run_dir, config, task.interface) as run:
         task_file.remember(run_dir, config)
         state, measured = run.load(template), are_kept(run.path, config.task)
@@ -113,7 +124,14 @@ def _train(config: Config, run_dir: str | Path | None, progress: Progress) -> Sa
             check(config, task)
             if not measured:
                 _measure_yardsticks(config, task, run, progress)
-        return _loop(config, task, state or template, progress, run.save, run.episodes)
+        callbacks.on_begin(config, run.path, run.rows)
+
+        def save(state: Saved, row: Row) -> Mapping[str, Any]:
+            written = run.save(state, row)
+            callbacks.on_checkpoint(run.newest)
+            return written
+
+        return _loop(config, task, state or template, progress, save, callbacks, run.episodes)
 
 
 def _say_where(config: Config, run: RunDirectory, state: Saved, measured: bool, progress: Progress) -> None:
@@ -161,6 +179,7 @@ def _loop(
     state: Saved,
     progress: Progress,
     save: Callable[[Saved, Row], Mapping[str, Any]],
+    callbacks: Callbacks,
     log: Log | None = None,
 ) -> Saved:
     seconds: list[float] = []
@@ -169,12 +188,14 @@ def _loop(
             started = time.monotonic()
             left = _iterations_left(config, state)
             progress.begin(state.iteration + 1, None if left is None else state.iteration + left)
-            state, row = _step(config, task, state, progress, log)
+            state, row = _step(config, task, state, progress, callbacks.log(log or Unkept()))
             written = save(state, row)
+            callbacks.on_iteration(written)
             seconds.append(time.monotonic() - started)
             progress.end(written, _seconds_left(seconds, _iterations_left(config, state)))
     finally:
         progress.close()
+        callbacks.on_end()
     return state
 
 

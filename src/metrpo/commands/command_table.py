@@ -19,6 +19,7 @@ COMMANDS: dict[str, dict[str, str]] = {
         "watch": "Show where many runs stand, live",
         "report": "Write one HTML page: curves, warnings, videos",
         "plot": "Draw learning curves",
+        "compare": "Set runs side by side in a table",
     },
     "Use": {
         "evaluate": "Play real episodes and say what they earn",

@@ -74,6 +74,7 @@ FEW = frozenset(
         "data",
         "learn_reward",
         "env_kwargs",
+        "track",
         "evaluation_episodes",
         "run_dir",
         "device",

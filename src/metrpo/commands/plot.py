@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -20,6 +21,7 @@ class Plot:
         metrpo plot runs/sweep
         metrpo plot runs/sweep --out sweep.pdf --x wall_seconds
         metrpo plot runs --y gap --x iteration
+        metrpo plot runs --title "Five seeds" --y-limits 0 400 --x-scale log --legend inside
     """
 
     dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
@@ -31,16 +33,34 @@ class Plot:
     y: Annotated[str, arg(metavar="COLUMN")] = "return_real"
     """Column of metrics.csv or diagnostics.csv to draw, such as gap, outside, error_T, error_10_3 or improved_0."""
 
+    title: Annotated[str | None, arg(metavar="TEXT")] = None
+    """Title above the panels."""
+    x_label: Annotated[str | None, arg(metavar="TEXT")] = None
+    """Name of the x axis."""
+    y_label: Annotated[str | None, arg(metavar="TEXT")] = None
+    """Name of the y axis."""
+    x_limits: Annotated[tuple[float, float] | None, arg(metavar="LOW HIGH")] = None
+    """Ends of the x axis."""
+    y_limits: Annotated[tuple[float, float] | None, arg(metavar="LOW HIGH")] = None
+    """Ends of the y axis."""
+    x_scale: Literal["auto", "linear", "log"] = "auto"
+    """The x axis; auto: logarithmic where some runs are many times longer than others."""
+    y_scale: Literal["auto", "linear", "log"] = "auto"
+    """The y axis; auto: logarithmic for errors of models. Points at or below 0 have no place on a logarithmic one."""
+    legend: Literal["below", "inside", "none"] = "below"
+    """Where the groups are named."""
+
     def __post_init__(self) -> None:
         require_directories("plot", self.dirs)
 
 
 def run(command: Plot) -> int:
     """Returns the exit code."""
-    from metrpo.plots.learning_curves import plot
+    from metrpo.plots.learning_curves import Look, plot
     from metrpo.run.find import find
 
     found = find(command.dirs)
     warn_of_skipped([{"path": path, "why": why} for path, why in found.skipped])
-    print(plot(found.runs, command.out, command.x, command.y))
+    look = Look(**{f.name: getattr(command, f.name) for f in dataclasses.fields(Look)})
+    print(plot(found.runs, command.out, command.x, command.y, look))
     return 0

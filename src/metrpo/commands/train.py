@@ -17,6 +17,7 @@ from metrpo.commands.options import RunOptions, Switch
 from metrpo.config import Config
 from metrpo.console.interrupt import Interruptible
 from metrpo.errors import MetrpoError
+from metrpo.trackers import TrackerName, trackers
 
 _log = logging.getLogger("metrpo")
 _AGAIN = "The same command would only make what is missing of its record, such as the video."
@@ -34,6 +35,8 @@ class Train(RunOptions):
     Every setting starts from the task's preset; metrpo train --help-all lists all.
     """
 
+    track: tuple[TrackerName, ...] = ()
+    """Log to these trackers, too (each is an extra: pip install 'metrpo[wandb]'); one that fails costs no learning."""
     video: Annotated[Switch, arg(help="Do not record the final policy as a video.")] = True
 
 
@@ -49,7 +52,7 @@ def run(command: Train) -> int:
 
     by_episode = config.method == "model-based"
     with attended_run(run_dir, default_progress(), keeps_episodes=by_episode, complete=complete) as progress:
-        train(config, run_dir, progress)
+        train(config, run_dir, progress, trackers(command.track))
         progress.close()
         try:
             say_outcome(run_dir, command.video)

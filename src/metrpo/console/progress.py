@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import logging
 import math
 import os
@@ -202,6 +203,19 @@ def _mute(stream: TextIO) -> None:
 def default_progress() -> Progress:
     """A live display on a terminal, plain lines elsewhere."""
     return LiveProgress() if sys.stdout is not None and sys.stdout.isatty() else PlainProgress()
+
+
+def library_progress() -> Progress:
+    """What a program that trains shows: a live display in a terminal or a notebook, and nothing elsewhere."""
+    if _is_notebook():
+        return TolerantProgress(LiveProgress() if importlib.util.find_spec("ipywidgets") else PlainProgress())
+    return TolerantProgress(LiveProgress()) if sys.stdout is not None and sys.stdout.isatty() else SILENT
+
+
+def _is_notebook() -> bool:
+    """Whether cells are run: in Jupyter, Colab and the like, not in IPython on a terminal."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return type(shell).__name__ not in ("NoneType", "TerminalInteractiveShell")
 
 
 def summary(row: Measured) -> str:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 X = Literal["real_steps", "wall_seconds", "iteration"]
+Scale = Literal["auto", "linear", "log"]
+Legend = Literal["below", "inside", "none"]
 FORMATS = ("png", "svg", "pdf")
 _DOTS = 25
 """Most points of a line that are marked each."""
@@ -41,7 +44,35 @@ _NAMES = {
 }
 
 
-def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "return_real") -> Path:
+@dataclass(frozen=True)
+class Look:
+    """How a picture of learning curves looks, where it is not to be as usual."""
+
+    title: str | None = None
+    """Above all panels."""
+    x_label: str | None = None
+    y_label: str | None = None
+    x_limits: tuple[float, float] | None = None
+    y_limits: tuple[float, float] | None = None
+    x_scale: Scale = "auto"
+    """Logarithmic by itself where some runs are many times longer than others."""
+    y_scale: Scale = "auto"
+    """Logarithmic by itself for errors of models."""
+    legend: Legend = "below"
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y"):
+            limits, scale = getattr(self, f"{name}_limits"), getattr(self, f"{name}_scale")
+            if limits is not None and not limits[0] < limits[1]:
+                raise ConfigError(f"{name}_limits: expected the lower one first, got {limits[0]:g} {limits[1]:g}")
+            if limits is not None and scale == "log" and limits[0] <= 0:
+                raise ConfigError(f"{name}_limits: expected limits above 0 on a logarithmic axis, got {limits[0]:g}")
+
+
+USUAL = Look()
+
+
+def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "return_real", look: Look = USUAL) -> Path:
     """Draws the column `y` against `x` to `path` (.png, .svg or .pdf), atomically, and returns it.
 
     `y` is one of metrics.csv or of diagnostics.csv. Raises `ConfigError` when the file has another ending or no run has
@@ -57,7 +88,11 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
     groups = [g for g in group(runs) if curve(g, x, y).seeds]
-    log_y = y.startswith(RATIOS) and all((seed[1] > 0).all() for g in groups for seed in curve(g, x, y).seeds)
+    log_y = look.y_scale == "log" or (
+        look.y_scale == "auto"
+        and y.startswith(RATIOS)
+        and all((seed[1] > 0).all() for g in groups for seed in curve(g, x, y).seeds)
+    )
     if not groups:
         raise ConfigError(f"y: expected a column that some run has together with {x}, got {y}; choose another --x")
     tasks = list(dict.fromkeys(g.task for g in groups))
@@ -67,7 +102,8 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
     panels = list(figure.subplots(lines, columns, squeeze=False).flat)
     for axes, task in zip(panels, tasks, strict=False):
         of_task = [g for g in groups if g.task == task]
-        log = is_far(x, [seed[0][-1] for g in of_task for seed in curve(g, x, y).seeds])
+        far = is_far(x, [seed[0][-1] for g in of_task for seed in curve(g, x, y).seeds])
+        log = far if look.x_scale == "auto" else look.x_scale == "log"
         for i, g in enumerate(of_task):
             c = curve(g, x, y, log, log_y)
             style = {"color": COLOURS[i % len(COLOURS)], "linestyle": ("-", "--", ":")[i // len(COLOURS) % 3]}
@@ -79,8 +115,8 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
             marker = "o" if len(c.seeds) == 1 and len(c.x) <= _DOTS else ""
             axes.plot(c.x, c.mean, **style, linewidth=2, marker=marker, markersize=3.5, label=name)
         axes.set_title(task, fontsize=11, parse_math=False)
-        axes.set_xlabel(_NAMES.get(x, x))
-        axes.set_ylabel(_NAMES.get(y, y), parse_math=False)
+        axes.set_xlabel(look.x_label or _NAMES.get(x, x), parse_math=False)
+        axes.set_ylabel(look.y_label or _NAMES.get(y, y), parse_math=False)
         tidy(axes)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         if x == "iteration":
@@ -90,11 +126,13 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
         if log:
             axes.set_xscale("log")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        legend = axes.legend(
-            frameon=False, fontsize=8, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.14), handlelength=3
-        )
-        for text in legend.get_texts():
-            text.set_parse_math(False)
+        if look.x_limits is not None:
+            axes.set_xlim(*look.x_limits)
+        if look.y_limits is not None:
+            axes.set_ylim(*look.y_limits)
+        _add_legend(axes, look.legend)
+    if look.title is not None:
+        figure.suptitle(look.title, fontsize=13, parse_math=False)
     for axes in panels[len(tasks) :]:
         axes.set_axis_off()
     picture = io.BytesIO()
@@ -104,6 +142,16 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
         figure.savefig(picture, format=kind, metadata=nothing)
     atomic_write(path, picture.getvalue())
     return path
+
+
+def _add_legend(axes: Axes, where: Legend) -> None:
+    if where == "none":
+        return
+    place: dict[str, Any] = {"loc": "best"}
+    if where == "below":
+        place = {"ncols": 3, "loc": "upper center", "bbox_to_anchor": (0.5, -0.14)}
+    for text in axes.legend(frameon=False, fontsize=8, handlelength=3, **place).get_texts():
+        text.set_parse_math(False)
 
 
 def _logarithmic(axes: Axes) -> None:

@@ -166,6 +166,11 @@ class RunDirectory:
         self.episodes.forget(before=self._taken[0])  # last: the checkpoint that would need them is gone
         return written
 
+    @property
+    def newest(self) -> Path:
+        """The file of the newest checkpoint."""
+        return self._checkpoints()[-1]
+
     def _load_newest(self, found: list[Path], template: State) -> tuple[State, dict[str, Any]]:
         """The newest checkpoint that is as it was written; damaged ones are set aside."""
         damaged: list[tuple[Path, DamagedFile]] = []

@@ -1,0 +1,32 @@
+"""Weights & Biases; `WANDB_MODE=offline` keeps all on this machine, `WANDB_PROJECT` names another project."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from metrpo.trackers.common import PROJECT, Tracker
+
+
+class Wandb(Tracker):
+    """A run of Weights & Biases, whose files lie in the run directory."""
+
+    name = "wandb"
+
+    def start(self, title: str, settings: dict[str, Any], run_dir: Path | None, earlier: str | None) -> str | None:
+        """As `Tracker.start`."""
+        import wandb
+
+        more = {} if earlier is None else {"id": earlier, "resume": "allow"}
+        project = os.environ.get("WANDB_PROJECT", PROJECT)
+        self._run: Any = wandb.init(project=project, name=title, config=settings, dir=run_dir, **more)
+        return str(self._run.id)
+
+    def log(self, numbers: dict[str, float], iteration: int) -> None:
+        """As `Tracker.log`."""
+        self._run.log(numbers, step=iteration)
+
+    def on_end(self) -> None:
+        """Ends the run."""
+        self._run.finish()
