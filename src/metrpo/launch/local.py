@@ -36,6 +36,7 @@ def run_locally(runs: list[RunSpec], out: Path, means: Means, tell: Tell) -> lis
     """Runs all, so many at a time on cores of their own, and returns those that failed (see `reproduce`)."""
     jobs = means.jobs or max(1, machine.cores() // (means.cpus or 1))
     tell(f"{jobs} at a time on this machine")
+    machine.divide_gpu(jobs)
     free, failed = shares_of_cores(jobs, means.cpus), list[RunSpec]()
     children: list[_Child] = []
     reported = time.monotonic()

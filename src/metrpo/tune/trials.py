@@ -18,6 +18,7 @@ from metrpo.launch.local import shares_of_cores
 from metrpo.launch.processes import Begin, Cores, Orphan, Worker, begin
 from metrpo.launch.run_spec import RunSpec
 from metrpo.launch.status import Tell, log_of, rows_of, tail
+from metrpo.run import machine
 from metrpo.run.metrics import Row
 from metrpo.tune.results import Tuned, shown, tuned
 from metrpo.tune.search import Search, worth
@@ -75,6 +76,7 @@ class _Tuning:
 
     def __init__(self, search: Search, study: Study, out: Path, jobs: int, tell: Tell, begin: Begin) -> None:
         self._search, self._study, self._out, self._tell, self._begin = search, study, out, tell, begin
+        machine.divide_gpu(jobs * len(search.seeds))
         seeds, shares = len(search.seeds), shares_of_cores(jobs * len(search.seeds))
         self._free = [shares[i * seeds : (i + 1) * seeds] for i in range(jobs)]
         self._going: list[_Going] = []
