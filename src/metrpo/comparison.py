@@ -162,8 +162,8 @@ def _range(interval: Interval, digits: int) -> str:
 def notes(found: Sequence[Compared]) -> list[str]:
     """What a reader of the table must know."""
     said = [
-        "last return: mean over seeds of the last evaluation, with its 95 % bootstrap interval; steps to it: median real "
-        "steps to the level, over the seeds that reach it; better: probability that a seed earns more than one of the "
-        "reference."
+        "last return: mean over seeds of the last evaluation, with its 95 % bootstrap interval; steps to it: median "
+        "real steps to the level, of the seeds that reach it; better: probability that a seed earns more than one of "
+        "the reference."
     ]
     return said + list(dict.fromkeys(one.caveat for one in found if one.caveat))

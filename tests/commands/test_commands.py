@@ -609,7 +609,7 @@ STOPPED = """
 import signal, sys, time, types
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what runs in its background
 stub = types.ModuleType("metrpo.training")
-def train(config, run_dir, progress):
+def train(config, run_dir, progress, callbacks):
     progress.begin(1, 2)
     print("training", flush=True)
     time.sleep(60)

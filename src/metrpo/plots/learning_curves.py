@@ -88,11 +88,9 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
     groups = [g for g in group(runs) if curve(g, x, y).seeds]
-    log_y = look.y_scale == "log" or (
-        look.y_scale == "auto"
-        and y.startswith(RATIOS)
-        and all((seed[1] > 0).all() for g in groups for seed in curve(g, x, y).seeds)
-    )
+    log_y = look.y_scale == "log"
+    if look.y_scale == "auto" and y.startswith(RATIOS):
+        log_y = all((seed[1] > 0).all() for g in groups for seed in curve(g, x, y).seeds)
     if not groups:
         raise ConfigError(f"y: expected a column that some run has together with {x}, got {y}; choose another --x")
     tasks = list(dict.fromkeys(g.task for g in groups))

@@ -1,0 +1,140 @@
+"""Groups of runs side by side: numbers that can be worked out by hand, and every format of the table."""
+
+import csv
+import dataclasses
+import io
+import json
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from metrpo.commands import main
+from metrpo.comparison import compare
+from metrpo.config import Config
+from metrpo.errors import ConfigError
+from metrpo.plots.bands import curve
+from metrpo.plots.learning_curves import Look, plot
+from metrpo.run.find import find, group
+from seen_runs import Page, a_run
+
+
+def rows(returns):
+    return [
+        {"iteration": i, "real_steps": 100 * i, "return_real": value, "return_collected": -1.0}
+        for i, value in enumerate(returns, 1)
+    ]
+
+
+CURVES = {
+    "me-trpo": [(0.0, 10.0, 20.0), (0.0, 20.0, 24.0), (4.0, 30.0, 28.0)],
+    "trpo": [(0.0, 1.0, 2.0), (0.0, 2.0, 4.0), (0.0, 3.0, 6.0)],
+}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for system, curves in CURVES.items():
+        for seed, returns in enumerate(curves):
+            config = Config("Swimmer", system=system, seed=seed)
+            a_run(tmp_path / "runs" / system / f"seed-{seed}", config, rows(returns))
+    a_run(tmp_path / "runs" / "other" / "seed-0", Config("Hopper"), rows([7.0, float("nan")]))
+    (a_run(tmp_path / "runs" / "none" / "seed-0", Config("Ant"), []) / "run.json").write_text("{}")
+    return tmp_path / "runs"
+
+
+def test_numbers_are_those_worked_out_by_hand(folder):
+    hopper, ours, theirs = sorted(compare(find([folder]).runs, 15.0), key=lambda one: (one.task, one.label))
+    assert (ours.seeds, ours.last.value, ours.best, ours.real_steps) == (3, 24.0, 30.0, (300, 300))
+    assert 20.0 <= ours.last.low < 24.0 < ours.last.high <= 28.0
+    # 15 is passed at 250, 175 and 100 + 11 / 26 of 100 steps.
+    assert (ours.reached, ours.steps, ours.better) == (3, 175.0, None)
+    assert (theirs.reached, theirs.steps, theirs.against) == (0, None, "me-trpo")
+    assert dataclasses.astuple(theirs.better) == (0.0, 0.0, 0.0)
+    assert (hopper.last.value, hopper.caveat) == (7.0, "One seed: the interval is the point itself.")
+
+
+def test_the_level_is_what_all_reach_and_the_reference_may_be_named(folder):
+    found = {one.label: one for one in compare(find([folder]).runs, None, "trpo") if one.task == "Swimmer"}
+    assert {one.level for one in found.values()} == {4.0}
+    assert (found["me-trpo"].better.value, found["trpo"].better) == (1.0, None)
+    by_task = compare(find([folder]).runs, {"Hopper": 3.0})
+    assert {one.task: one.level for one in by_task} == {"Swimmer": 4.0, "Hopper": 3.0}
+    with pytest.raises(ConfigError, match="against: expected one of me-trpo, trpo, got ppo"):
+        compare(find([folder]).runs, None, "ppo")
+    with pytest.raises(ConfigError, match="expected runs with at least one evaluation, got none"):
+        compare([run for run in find([folder]).runs if run.config.task == "Ant"])
+
+
+@pytest.mark.parametrize("ending", ["md", "csv", "tex", "html"])
+def test_the_table_is_written_in_every_format(ending, folder, tmp_path, capsys):
+    out = tmp_path / "new" / f"table.{ending}"
+    assert main.main(["compare", str(folder), "--level", "15", "--out", str(out)]) == 0
+    assert capsys.readouterr().out == f"{out}\n"
+    text = out.read_text()
+    assert text.count("me-trpo") >= 2
+    if ending == "csv":
+        lines = list(csv.DictReader(io.StringIO(text)))
+        assert [line["last return"] for line in lines if line["system"] == "trpo"] == ["4.0"]
+        assert [line["steps to it"] for line in lines if line["task"] == "Swimmer"] == ["175", "-"]
+    if ending == "html":
+        assert "95 % bootstrap" in Page(f"<html>{text}</html>").text
+    if ending == "tex":
+        assert r"Swimmer & me-trpo & 3 & 300 & 24.0" in text
+        assert r"95 \% & best" in text
+    if ending == "md":
+        assert "| Swimmer | me-trpo | 3 | 300 | 24.0 |" in text
+
+
+def test_the_command_prints_a_table_or_json(folder, capsys):
+    assert main.main(["compare", str(folder), "--level", "Swimmer=15"]) == 0
+    assert "| 0.00 (0.00 to 0.00) |" in capsys.readouterr().out
+    assert main.main(["compare", str(folder), "--json"]) == 0
+    assert {one["task"] for one in json.loads(capsys.readouterr().out)} == {"Swimmer", "Hopper"}
+    for level, said in (("much", "expected a number or TASK=NUMBER, got 'much'"), ("1 2", "expected one number")):
+        assert main.main(["compare", str(folder), "--level", *level.split()]) == 2
+        assert said in capsys.readouterr().err
+    assert main.main(["compare", str(folder), "--out", "table.doc"]) == 2
+    assert "ends in .md, .csv, .tex, .html, got .doc" in capsys.readouterr().err
+
+
+# ---------------------------------------------------------------- pictures
+
+
+def test_a_picture_looks_as_asked(folder, tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: seen.append(self) or file.write(b"x"))
+    words = ["--title", "A $title", "--x-label", "steps", "--y-label", "earned", "--y-limits", "1", "40"]
+    words += ["--x-limits", "90", "310", "--y-scale", "log", "--x-scale", "log", "--legend", "inside"]
+    assert main.main(["plot", str(folder / "me-trpo"), "--out", str(tmp_path / "a.png"), *words]) == 0
+    axes = seen[0].axes[0]
+    assert (seen[0].get_suptitle(), axes.get_xlabel(), axes.get_ylabel()) == ("A $title", "steps", "earned")
+    assert (axes.get_xlim(), axes.get_ylim()) == ((90, 310), (1, 40))
+    assert (axes.get_xscale(), axes.get_yscale(), axes.get_legend() is not None) == ("log", "log", True)
+    plot(find([folder]).runs, tmp_path / "b.png", look=Look(legend="none"))
+    assert [a.get_legend() for a in seen[1].axes] == [None] * 2
+    assert seen[1].axes[0].get_xscale() == "linear"
+
+
+def test_looks_that_cannot_be_are_refused():
+    with pytest.raises(ConfigError, match="y_limits: expected the lower one first, got 4 1"):
+        Look(y_limits=(4, 1))
+    with pytest.raises(ConfigError, match="x_limits: expected limits above 0 on a logarithmic axis, got 0"):
+        Look(x_limits=(0, 1), x_scale="log")
+
+
+@pytest.mark.parametrize("log", [False, True])
+@pytest.mark.parametrize("log_y", [False, True])
+def test_the_band_of_two_seeds_holds_their_lines_on_any_axis(log, log_y, tmp_path):
+    for seed, returns in enumerate([(1.0, 900.0, 2.0, 400.0), (800.0, 3.0, 500.0, 1.0)]):
+        uneven = [row | {"real_steps": row["real_steps"] ** (1 + seed)} for row in rows(returns)]
+        if seed:
+            uneven = [r | {"real_steps": s} for r, s in zip(uneven, (90, 130, 320, 410), strict=True)]
+        a_run(tmp_path / f"seed-{seed}", Config("Swimmer", seed=seed), uneven)
+    (both,) = group(find([tmp_path]).runs)
+    c = curve(both, "real_steps", "return_real", log, log_y)
+    across, up = (np.log if is_log else np.asarray for is_log in (log, log_y))
+    for x, y in c.seeds:
+        line = np.interp(across(c.x), across(x), up(y))
+        assert (up(c.low) - 1e-9 <= line).all()
+        assert (line <= up(c.high) + 1e-9).all()
