@@ -4,7 +4,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup baselines ray train test test-slow docs lock clean
+.PHONY: help setup baselines ray train test test-slow docs package lock clean
 
 PYTHON ?=
 RUN_DIR ?=
@@ -40,6 +40,9 @@ test-slow: $(READY)  ## the tests that learn for minutes
 docs: $(DOCS)  ## build the documentation in site/; a broken link or anchor stops it
 	$(BIN)/python docs/prepare.py
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+package: $(READY)  ## build wheel and sdist, and try them where nothing else is installed
+	.ci/package $(BIN)/python
 
 setup: $(READY)  ## only set up .venv
 

@@ -47,7 +47,7 @@ def opened(path: Path, error: type[MetrpoError], most: int = LARGEST_FILE) -> It
     """
     try:
         # A pipe that nobody writes to must not hold us up.
-        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as file:
+        with open(path, "rb", opener=lambda name, flags: os.open(name, flags | getattr(os, "O_NONBLOCK", 0))) as file:
             about = os.fstat(file.fileno())
             if not stat.S_ISREG(about.st_mode):
                 raise error(f"cannot read {path}: expected an ordinary file, got a pipe or a device")

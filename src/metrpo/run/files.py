@@ -236,6 +236,8 @@ def make_directory(directory: Path) -> None:
 
 def sync_directory(directory: Path) -> None:
     """Puts on disk which files a directory has."""
+    if os.name == "nt":  # a directory is no file there
+        return
     handle = os.open(directory, os.O_RDONLY)
     try:
         os.fsync(handle)

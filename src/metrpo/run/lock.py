@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
+import logging
 import os
 import platform
 import shlex
@@ -20,6 +20,7 @@ from metrpo.errors import ConfigError, RunDirectoryError
 from metrpo.run.files import FORMAT, atomic_write, check_format, make_directory, metrpo_version, source_commit
 from metrpo.safe_load import json_of, text_of
 
+_log = logging.getLogger("metrpo")
 _POLL = 1.0
 """Seconds between two looks at a lock."""
 
@@ -88,7 +89,7 @@ def hold(path: Path) -> TextIO:
     except OSError as error:
         raise RunDirectoryError(f"cannot write in {path}: {error.strerror}; choose a writable directory") from error
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        _lock(file)
     except BlockingIOError:
         file.seek(0)
         holder = file.read(20).strip() or "unknown"
@@ -103,6 +104,16 @@ def hold(path: Path) -> TextIO:
         os.ftruncate(file.fileno(), 0)
         os.write(file.fileno(), str(os.getpid()).encode())
     return file
+
+
+def _lock(file: TextIO) -> None:
+    """Raises `BlockingIOError` when another process has locked it, `OSError` when that cannot be done here."""
+    try:
+        import fcntl  # of Unix alone
+    except ImportError:
+        _log.warning("this system has no file locks of Unix: see to it that no other process writes to this directory")
+        return
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def _check_or_describe(file: Path) -> None:
