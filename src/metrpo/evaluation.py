@@ -19,6 +19,7 @@ from metrpo.safe_load import brief
 from metrpo.world import collect
 from metrpo.world.registry import get_task, limited
 from metrpo.world.task import Task
+from metrpo.zoo import FOLDER, located
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def evaluate(
         known = _task_at(task, act.info if isinstance(act, LoadedPolicy) else None)
     else:
         made = act.info
-        of_run = task_of_run(policy, made) if isinstance(policy, str | Path) else None
+        of_run = task_of_run(located(policy), made) if isinstance(policy, str | Path) else None
         known = of_run or get_task(made.task, made.env_kwargs, made.imports)
     if isinstance(act, LoadedPolicy):
         _require_fit(act, known)
@@ -87,7 +88,8 @@ def evaluate(
 
 
 def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0, task: str | None = None) -> Path:
-    """Records one real episode of a run's policy, by default to `video.mp4` in the run directory; returns the file.
+    """Records one real episode of a run's policy, by default to `video.mp4` in the run directory (of
+    `zoo:NAME`, to `NAME.mp4` here); returns the file.
 
     `task` says where the run's task is, if its file has moved.
 
@@ -96,10 +98,12 @@ def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0, ta
     """
     _require_seed(seed)
     policy = load_policy(run_dir)
+    run_dir = located(run_dir)
     known = task_of_run(run_dir, policy.info) if task is None else _task_at(task, policy.info)
     _require_fit(policy, known)
     policy.reset()
-    return record(known.make_env, policy, Path(out or Path(run_dir) / "video.mp4"), seed)
+    beside = Path(f"{run_dir.name}.mp4") if run_dir.parent == FOLDER else run_dir / "video.mp4"
+    return record(known.make_env, policy, Path(out or beside), seed)
 
 
 def _task_at(task: str, made: PolicyInfo | None) -> Task:

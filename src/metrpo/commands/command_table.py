@@ -22,6 +22,7 @@ COMMANDS: dict[str, dict[str, str]] = {
         "compare": "Set runs side by side in a table",
     },
     "Use": {
+        "zoo": "List the trained policies that come with metrpo",
         "evaluate": "Play real episodes and say what they earn",
         "render": "Record an episode as a video",
         "export": "Write the policy as one file without metrpo",

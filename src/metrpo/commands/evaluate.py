@@ -23,7 +23,7 @@ class Evaluate:
     """
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
-    """The run directory."""
+    """The run directory, or zoo:NAME (see: metrpo zoo)."""
     episodes: int = 20
     """How many."""
     seed: int = 0

@@ -20,7 +20,7 @@ class Export:
     """
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
-    """The run directory."""
+    """The run directory, or zoo:NAME (see: metrpo zoo)."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """File to write, .py, .onnx or .npz; default: policy.py in the run directory; missing folders are made."""
 

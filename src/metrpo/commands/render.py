@@ -19,7 +19,7 @@ class Render:
     """
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
-    """The run directory."""
+    """The run directory, or zoo:NAME (see: metrpo zoo)."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """File to write, .mp4 or .gif; default: video.mp4 in the run directory; missing folders are made."""
     seed: int = 0

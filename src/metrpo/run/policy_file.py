@@ -17,6 +17,7 @@ from metrpo.errors import RunDirectoryError
 from metrpo.limits import Limits
 from metrpo.run.files import FORMAT, atomic_write, inside, metrpo_version, read_arrays, write_arrays
 from metrpo.safe_load import brief
+from metrpo.zoo import located
 
 FILE = "policy.npz"
 
@@ -219,12 +220,12 @@ def with_interface(info: PolicyInfo, interface: Interface | None) -> PolicyInfo:
 
 
 def load_policy(directory: str | Path) -> LoadedPolicy:
-    """The policy of a run directory (or of a `policy.npz` itself); needs NumPy only.
+    """The policy of a run directory, of `zoo:NAME` or of a `policy.npz` itself; needs NumPy only.
 
     Raises `RunDirectoryError` when there is none, or it is damaged, of another version or cannot act: other arrays than
     its sizes say, or weights that are not finite.
     """
-    path = Path(directory)
+    path = located(directory)
     if path.suffix != ".npz" and path.is_file():
         raise RunDirectoryError(f"{path} is a file; expected a run directory, or a policy.npz")
     path = path if path.suffix == ".npz" else path / FILE

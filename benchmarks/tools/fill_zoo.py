@@ -1,0 +1,117 @@
+"""Chooses the policies of `metrpo zoo` among committed runs: `python benchmarks/tools/fill_zoo.py [FOLDER...]`.
+
+For each task that can be played by its name, the policy with the best real return in its run's last evaluation, of all
+ME-TRPO runs under the folders (default: results/); not one that earns no more than doing nothing or random actions.
+Writes `src/metrpo/zoo_policies/` anew, policies in today's format and a card each. Run it again when runs are added.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from metrpo import load_policy, zoo
+from metrpo.errors import MetrpoError, TaskError
+from metrpo.policy.gaussian import Policy
+from metrpo.run.about import about
+from metrpo.run.files import folder_name, read_arrays
+from metrpo.run.find import SeenRun, find
+from metrpo.run.policy_file import FILE, save_policy
+from metrpo.world.registry import task_for
+
+RESULTS = Path(__file__).resolve().parents[2] / "results"
+POINTS = 12
+"""Of a card's learning curve."""
+
+
+def candidates(folders: list[Path]) -> dict[str, list[SeenRun]]:
+    """By task, the runs that left a policy with a real return."""
+    found: dict[str, list[SeenRun]] = defaultdict(list)
+    for run in find(folders).runs:
+        config = run.config
+        plain = config.method == "model-based" and config.data is None and not config.env_kwargs
+        if plain and ":" not in config.task and (run.path / FILE).is_file() and _return(run) is not None:
+            found[config.task].append(run)
+    return dict(sorted(found.items()))
+
+
+def no_skill(run: SeenRun, measured: dict[str, Any]) -> float | None:
+    """The most that doing nothing or random actions earn on its task; None: not measured."""
+    known = [one["mean"] for one in measured.get(run.config.task, {}).values()] + list(run.yardsticks.values())
+    return max(known, default=None)
+
+
+def add(runs: list[SeenRun], floor: float | None, folder: Path) -> None:
+    """Writes the best policy of a task's runs, and its card."""
+    best = max(runs, key=lambda run: _return(run) or -np.inf)
+    info, (arrays, _) = load_policy(best.path).info, read_arrays(best.path / FILE)
+    layers = tuple((arrays[f"w{i}"], arrays[f"b{i}"]) for i in range(len(info.hidden) + 1))
+    policy, task, made = Policy(layers, arrays["log_std"]), task_for(best.config), about(best.path)
+    folder.mkdir(parents=True)
+    numbers = (info.iteration, info.real_steps, info.return_real)
+    origin = arrays.get("origin")
+    save_policy(folder, policy, info.task, *numbers, task.interface, origin, best.config)  # type: ignore[arg-type]
+    steps, returns = best.column("real_steps"), best.column("return_real")
+    there = np.flatnonzero(np.isfinite(returns))
+    shown = there[np.unique(np.linspace(0, len(there) - 1, POINTS).astype(int))]
+    card = {
+        "task": info.task,
+        "return": info.return_real,
+        "no_skill": floor,
+        "real_steps": info.real_steps,
+        "system": best.config.system,
+        "preset": best.config.preset,
+        "seed": best.config.seed,
+        "chosen_of": len(runs),
+        "mean_of_runs": float(np.mean([_return(run) for run in runs])),
+        "run": _name_of(best.path),
+        "commit": made.get("commit"),
+        "created": str(made.get("created", ""))[:10] or None,
+        "curve": [[int(steps[i]), round(float(returns[i]), 2)] for i in shown],
+    }
+    (folder / zoo.CARD).write_text(json.dumps(card, indent=1) + "\n", "utf-8")
+
+
+def fill(folders: list[Path], out: Path, measured: dict[str, Any]) -> list[str]:
+    """Writes the zoo anew to `out`; returns a line for each task."""
+    shutil.rmtree(out, ignore_errors=True)
+    lines = []
+    for task, runs in candidates(folders).items():
+        best, floor = max(_return(run) or -np.inf for run in runs), no_skill(runs[0], measured)
+        if floor is not None and best <= floor:
+            lines.append(f"left out {task}: {best:.1f}, and no skill earns {floor:.1f}")
+            continue
+        try:
+            add(runs, floor, out / folder_name(task))
+        except TaskError as error:
+            lines.append(f"left out {task}: {error}")
+            continue
+        lines.append(f"zoo:{folder_name(task)}: {best:.1f}, the best of {len(runs)} runs")
+    return lines
+
+
+def _name_of(path: Path) -> str:
+    """Where a run lies in the repository; elsewhere its folder's name."""
+    whole, root = path.resolve(), RESULTS.parent
+    return str(whole.relative_to(root)) if whole.is_relative_to(root) else path.name
+
+
+def _return(run: SeenRun) -> float | None:
+    try:
+        found = load_policy(run.path).info.return_real
+    except MetrpoError:
+        return None
+    return found if isinstance(found, float) and np.isfinite(found) else None
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", type=Path, nargs="*", default=[RESULTS])
+    given = parser.parse_args()
+    print("\n".join(fill(given.folders, zoo.FOLDER, json.loads((RESULTS / "yardsticks.json").read_text()))))
