@@ -58,6 +58,8 @@ def test_the_level_is_what_all_reach_and_the_reference_may_be_named(folder):
     found = {one.label: one for one in compare(find([folder]).runs, None, "trpo") if one.task == "Swimmer"}
     assert {one.level for one in found.values()} == {4.0}
     assert (found["me-trpo"].better.value, found["trpo"].better) == (1.0, None)
+    backwards = compare(find([folder]).runs[::-1])
+    assert {one.against for one in backwards if one.task == "Swimmer"} == {"me-trpo"}
     by_task = compare(find([folder]).runs, {"Hopper": 3.0})
     assert {one.task: one.level for one in by_task} == {"Swimmer": 4.0, "Hopper": 3.0}
     with pytest.raises(ConfigError, match="against: expected one of me-trpo, trpo, got ppo"):

@@ -59,7 +59,8 @@ def compare(
     """Every group of the runs, tasks in the order of their first run; runs without an evaluation are left out.
 
     `levels` is the return of interest, for all tasks or by task; where there is none, the least of the groups' mean
-    last returns. `against` is the label of the group that others are held against, by default a task's first.
+    last returns. `against` is the label of the group that others are held against, by default me-trpo, or a task's
+    first where it has none.
 
     Raises `ConfigError` when no run has a return, or no group is called `against`.
     """
@@ -72,7 +73,7 @@ def compare(
     found = []
     for task in dict.fromkeys(g.task for g in groups):
         here = [g for g in groups if g.task == task]
-        reference = next((g for g in here if g.label == against), here[0])
+        reference = next((g for name in (against, "me-trpo") for g in here if g.label == name), here[0])
         given = levels.get(task) if isinstance(levels, Mapping) else levels
         level = min(float(np.mean(_last(g))) for g in here) if given is None else given
         found += [_compared(g, reference, level) for g in here]

@@ -30,7 +30,8 @@ class Compare:
     """Return whose real steps are counted: a number, or TASK=NUMBER for each task; default: what all groups reach on
     average."""
     against: Annotated[str | None, arg(metavar="SYSTEM")] = None
-    """The group that the others are held against, as the table calls it; default: each task's first."""
+    """The group that the others are held against, as the table calls it; default: me-trpo, or each
+    task's first."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """Also write the table to this file: .md, .csv, .tex or .html."""
     json: Switch = False

@@ -21,7 +21,7 @@ class Plot:
         metrpo plot runs/sweep
         metrpo plot runs/sweep --out sweep.pdf --x wall_seconds
         metrpo plot runs --y gap --x iteration
-        metrpo plot runs --title "Five seeds" --y-limits 0 400 --x-scale log --legend inside
+        metrpo plot runs --title "Five seeds" --y-limits 0 400 --x-scale log
     """
 
     dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
