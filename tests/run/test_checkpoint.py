@@ -183,13 +183,31 @@ def test_a_task_of_another_size_is_no_other_version(tmp_path):
     assert not re.search("use that version|expected 2 arrays", str(error.value))
 
 
-def test_another_version_is_named_where_it_wrote_other_arrays(tmp_path, monkeypatch):
+@pytest.mark.parametrize("of", ["7.0", "0.0.1"])
+def test_another_version_is_named_where_it_wrote_other_arrays(tmp_path, monkeypatch, of):
     path = tmp_path / "a.npz"
     with monkeypatch.context() as patch:
-        patch.setattr(files, "metrpo_version", lambda: "7.0")
+        patch.setattr(files, "metrpo_version", lambda: of)
         save_state(path, {"x": np.zeros(2)}, {})
-    with pytest.raises(RunDirectoryError, match=r"lacks \['y'\]; it has unknown .* by metrpo '7.0': use that version"):
+    with pytest.raises(
+        RunDirectoryError, match=rf"lacks \['y'\]; it has unknown .* by metrpo '{of}': use that version"
+    ):
         load_state(path, {"y": np.zeros(2)})
+
+
+@pytest.mark.parametrize(
+    "saved",
+    [
+        {"x": np.zeros((2, 3), np.float32), "y": np.zeros(2, np.float32), "more": np.zeros(2)},
+        {"x": np.zeros((2, 3), np.float32), "y": np.zeros(2)},
+    ],
+)
+def test_what_is_not_only_of_another_size_is_not_blamed_on_the_task(tmp_path, saved):
+    path = tmp_path / "a.npz"
+    save_state(path, saved, {})
+    with pytest.raises(RunDirectoryError, match=r"\['x'\] of shape \[2, 3\]") as error:
+        load_state(path, {"x": np.zeros((2, 5), np.float32), "y": np.zeros(2, np.float32)})
+    assert "another size" not in str(error.value)
 
 
 def test_another_format_is_refused_by_name(tmp_path, monkeypatch):

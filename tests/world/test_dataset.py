@@ -159,3 +159,59 @@ def test_capacity_pads_with_rows_that_the_size_excludes(size):
         assert now.dtype == np.float32
         np.testing.assert_array_equal(now[:size], before)
         assert not np.any(now[size:])
+
+
+@pytest.mark.parametrize(
+    ("size", "most", "rows"), [(0, 99, 5), (5, 99, 5), (6, 99, 10), (11, 99, 20), (6, 7, 7), (5, 3, 3)]
+)
+def test_room_for_little_is_made_at_once_and_then_doubled(monkeypatch, size, most, rows):
+    monkeypatch.setattr(datasets, "ROOM", 5 * 4 * (4 + 2 + 4) + 39)  # bytes of five transitions, and not of six
+    small = random_transitions(np.random.default_rng(0), min(size, most))
+    assert len(datasets.with_capacity(small, most).states) == rows
+
+
+def test_a_transition_wider_than_the_room_has_a_row_of_its_own(monkeypatch):
+    monkeypatch.setattr(datasets, "ROOM", 1)
+    assert len(datasets.with_capacity(random_transitions(np.random.default_rng(0), 1), 99).states) == 1
+
+
+def test_there_is_room_for_what_the_widest_robot_gives_and_for_no_gibibyte():
+    assert 200_000 * 4 * (348 + 17 + 348) <= datasets.ROOM < 1 << 30
+
+
+def test_states_far_from_zero_are_counted_from_where_the_first_data_lie():
+    rng = np.random.default_rng(0)
+    offset = np.array([1e8, 50.0, -3000.0])
+
+    def episodes(around):
+        plain = [random_episode(rng, 6, state_size=3) for _ in range(4)]
+        return [e._replace(states=around + rng.normal(size=(7, 3))) for e in plain]
+
+    first, second = episodes(offset), episodes(2 * offset)
+    dataset = datasets.add(datasets.empty(3, 2), first, CONFIG, np.random.default_rng(1))
+    mean = np.concatenate([e.states for e in first]).mean(axis=0)
+    np.testing.assert_allclose(dataset.origin, [mean[0], 0, mean[2]], rtol=1e-12)
+    for episode in first:
+        near = episode.states - dataset.origin
+        near[:, 1] = near[:, 1].astype(np.float32)  # what has no origin is rounded before it is subtracted
+        kept = [t for t in (dataset.train, dataset.validation) if (t.actions == episode.actions[0]).all(axis=1).any()]
+        at = int(np.argmax((kept[0].actions == episode.actions[0]).all(axis=1)))
+        np.testing.assert_array_equal(kept[0].states[at : at + 6], near[:-1].astype(np.float32))
+        np.testing.assert_array_equal(kept[0].deltas[at : at + 6], np.diff(near, axis=0).astype(np.float32))
+    later = datasets.add(dataset, second, CONFIG, np.random.default_rng(1))
+    np.testing.assert_array_equal(later.origin, dataset.origin)
+
+
+def test_no_episodes_add_nothing():
+    dataset = datasets.add(datasets.empty(3, 2), [], CONFIG, np.random.default_rng(0))
+    assert (dataset.train.size, dataset.validation.size, len(dataset.starts)) == (0, 0, 0)
+    assert not dataset.origin.any()
+
+
+def test_without_an_origin_states_are_those_of_float32():
+    rng = np.random.default_rng(0)
+    episode = random_episode(rng, 6)._replace(states=50 + rng.normal(size=(7, 4)))
+    rows = datasets.append(datasets.empty(4, 2).train, [episode], 99)
+    rounded = episode.states.astype(np.float32)
+    np.testing.assert_array_equal(rows.states, rounded[:-1])
+    np.testing.assert_array_equal(rows.deltas, np.diff(rounded, axis=0))
