@@ -47,7 +47,7 @@ FAST_ALL: Overrides = {
     "fit.reinitialise_every": 0,
     "fit.weight_decay": 0.3,
     "imagine.steps": 40_000,
-    "policy.mean_penalty": 0.3,
+    "policy.mean_penalty": 1.0,
     "policy.min_std": 0.2,
     "policy.normalise": True,
     "validate.max_updates": 100,
