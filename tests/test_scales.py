@@ -189,7 +189,7 @@ def test_an_origin_that_does_not_fit_is_refused(tmp_path, origin):
 
 def test_an_old_checkpoint_has_no_origin_another_size_is_refused(tmp_path):
     path = tmp_path / "state.npz"
-    state = algorithm.State(*[0] * 6, datasets.empty(2, 1))
+    state = algorithm.State(*[0] * 6, datasets.empty(2, 1), 0)
     save_state(path, state, {})
     arrays, meta = read_arrays(path)
     assert arrays[".dataset.origin"].dtype == np.float64

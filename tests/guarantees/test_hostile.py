@@ -301,7 +301,7 @@ def test_an_exported_policy_runs_nothing_of_its_weights(tmp_path, sound):
     imports = re.findall(r"^ *(?:import|from) .*", source, re.MULTILINE)
     # The third is the docstring's example.
     assert imports == [
-        "    from policy import act, control  # or whatever this file is called",
+        "    from policy import act, control, reset  # or whatever this file is called",
         "import base64",
         "import hashlib",
         "import numpy as np",

@@ -73,7 +73,7 @@ def task_for(config: Config) -> Task:
 @cache
 def limited(task: Task, limits: Limits) -> Task:
     """The task in which every policy is held to `limits`; the same object every time."""
-    return dataclasses.replace(task, limits=limits)
+    return task if task.limits == limits else dataclasses.replace(task, limits=limits)
 
 
 @cache
