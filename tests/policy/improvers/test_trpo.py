@@ -131,20 +131,44 @@ def test_conjugate_gradient_stays_put_once_solved():
     np.testing.assert_array_equal(x, 0)
 
 
-def test_the_step_is_the_natural_gradient_of_length_max_kl():
-    """Against a dense solve: direction F^-1 g, length sqrt(2 max_kl / x'Fx), shortened by the line search alone."""
-    policy = random_policy(11, hidden=(3,))
+def slow_cg(matrix, target, iterations):
+    """Conjugate gradients in float64, from 0."""
+    x, residual = np.zeros_like(target), target
+    direction = residual
+    for _ in range(iterations):
+        alpha = residual @ residual / (direction @ matrix @ direction)
+        x, before = x + alpha * direction, residual
+        residual = residual - alpha * matrix @ direction
+        direction = residual + residual @ residual / (before @ before) * direction
+    return x
+
+
+@pytest.mark.parametrize(("iterations", "penalty"), [(60, 0.0), (60, 0.7), (2, 0.0)])
+def test_the_step_is_the_natural_gradient_of_length_max_kl(iterations, penalty):
+    """Against dense matrices: direction F^-1 g, length sqrt(2 max_kl / x'Fx), shortened by the line search alone.
+
+    Also where the conjugate gradients are not done, and with a penalty, whose slope is that of finite differences.
+    """
+    policy = random_policy(11, hidden=(3,), scale=4.0 if penalty else 1.0)
     batch = a_batch(12, policy)
-    config = TRPOConfig(max_kl=1e-3, cg_iterations=60, damping=0.05)
-    new, info = improve(policy, batch, config)
-    flat, _ = ravel_pytree(policy)
-    gradient = surrogate_gradient(policy, batch)
+    config = TRPOConfig(max_kl=1e-3, cg_iterations=iterations, damping=0.05)
+    new, info = improve(policy, batch, config, penalty=penalty)
+    flat, unravel = ravel_pytree(policy)
+    std = np.exp(policy.log_std)
+
+    def cost(at):
+        return penalty * slow_penalty(unravel(at.astype(np.float32)), batch, std)
+
+    exact = np.asarray(flat, np.float64)
+    slopes = [(cost(exact + d) - cost(exact - d)) / 2e-2 for d in 1e-2 * np.eye(exact.size)]
+    gradient = surrogate_gradient(policy, batch) - np.array(slopes)
+    assert (np.abs(slopes).max() > 0.1) == (penalty > 0), "the penalty must matter"
     fisher = dense_fisher(policy, batch.states, batch.mask) + 0.05 * np.eye(flat.size)
-    x = np.linalg.solve(fisher, gradient)
+    x = np.linalg.solve(fisher, gradient) if iterations > 9 else slow_cg(fisher, gradient, iterations)
     full = x * np.sqrt(2 * config.max_kl / (x @ fisher @ x))
     step = np.asarray(ravel_pytree(new)[0], np.float64) - np.asarray(flat, np.float64)
     assert info.accepted
-    assert info.cg_residual < 1e-3
+    assert (info.cg_residual < 1e-3) == (iterations > 9)
     np.testing.assert_allclose(step, full * 0.8 ** int(info.backtracks), atol=2e-3 * np.abs(full).max())
 
 
