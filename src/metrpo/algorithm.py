@@ -33,7 +33,7 @@ from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.stages.ensemble_fit import fit_ensemble, fresh_networks
 from metrpo.stages.log import Log, Unkept, left_out
 from metrpo.stages.policy_search import improve_policy
-from metrpo.stages.proven import prove, settle
+from metrpo.stages.proven import prove, settle, steps_kept_for_proof
 from metrpo.stages.real_steps import collect
 from metrpo.stages.records import NOTHING, Done, Real, record
 from metrpo.stages.state import Proven, Row, State, inputs_for
@@ -80,7 +80,8 @@ def step(
     """One outer iteration: collect, fit, improve until the ensemble disagrees; and evaluate, for the record only."""
     clock, log = Clock(), log or Unkept()
     with clock("collect"):
-        episodes = collect(config, task, state, progress, log)
+        kept = steps_kept_for_proof(config, task, state.real_steps)
+        episodes = collect(config, task, state, progress, log, kept=kept)
     real = Real(left_out(log), partial(prove, config, task, state, progress, log))
     return learn(config, task, state, episodes, progress, clock, real)
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from metrpo.config import Config
+from metrpo.stages.log import Log
 from metrpo.types import Episode
 
 _log = logging.getLogger("metrpo")
@@ -24,7 +25,7 @@ class Callback(Protocol):
         """Training begins, or goes on after the iterations in `rows`."""
 
     def on_episode(self, episode: Episode) -> None:
-        """One more real episode has been played, with exploration (only where the method learns models)."""
+        """One more real episode has been played, exploring or as a proof (only where the method learns models)."""
 
     def on_iteration(self, row: Row) -> None:
         """An outer iteration is finished, with this row of `metrics.csv`."""
@@ -62,8 +63,8 @@ class Callbacks(Callback):
         """Passed on."""
         self._tell(lambda one: one.on_end())
 
-    def log(self, log: Any) -> Any:
-        """A log of episodes (`stages.real_steps.Log`) that tells the callbacks of each one."""
+    def log(self, log: Log) -> Log:
+        """A log of episodes that tells the callbacks of each one."""
         return _Telling(log, self) if self._callbacks else log
 
     def _tell(self, what: Callable[[Callback], None]) -> None:
@@ -79,14 +80,13 @@ class Callbacks(Callback):
 class _Telling:
     """A log of episodes that tells of each one that is added."""
 
-    def __init__(self, log: Any, callbacks: Callbacks) -> None:
+    def __init__(self, log: Log, callbacks: Callbacks) -> None:
         self._log, self._callbacks = log, callbacks
+        self.pending, self.proofs = log.pending, log.proofs
+        self.failures, self.note_failures = log.failures, log.note_failures
 
-    def append(self, episode: Episode) -> object:
+    def append(self, episode: Episode, proof: bool = False) -> object:
         """Keeps it, and tells of it."""
-        kept = self._log.append(episode)
+        kept = self._log.append(episode, proof)
         self._callbacks.on_episode(episode)
         return kept
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._log, name)

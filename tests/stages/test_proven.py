@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 import probe
 import tiny_run
 from helpers import random_policy
-from metrpo import algorithm, training
+from metrpo import algorithm, external, training
+from metrpo.callbacks import Callback
 from metrpo.config import Config
 from metrpo.errors import EpisodeError
 from metrpo.policy import gaussian
@@ -196,7 +197,32 @@ def test_an_environment_that_fails_in_a_proof_costs_no_learning(two, monkeypatch
     assert "the motor is hot" in caplog.text
 
 
+def test_a_callback_hears_of_proofs_as_of_other_episodes():
+    heard = []
+
+    class Hearing(Callback):
+        def on_episode(self, episode):
+            heard.append(len(episode.rewards))
+
+    training.train(override(TRIED, {"iterations": 1}), callbacks=[Hearing()])
+    assert heard == [probe.HORIZON] * EPISODES
+
+
 # ---------------------------------------------------------------- how many steps
+
+
+def test_what_nobody_proves_is_collected_whole(tmp_path, quick):
+    external.begin(TRIED, tmp_path)
+    episodes = external.collect(tmp_path)
+    assert sum(len(e.rewards) for e in episodes) == TRIED.collect.steps, "another program has no proofs to play"
+
+
+def test_proofs_stay_within_the_budget_of_a_run_that_has_collected_more(tmp_path, quick):
+    config = override(TRIED, {"real_steps": TRIED.collect.steps})
+    external.begin(config, tmp_path)
+    external.collect(tmp_path)
+    state = training.train(config, tmp_path)
+    assert (state.real_steps, state.proven.episodes) == (TRIED.collect.steps, 0)
 
 
 def test_a_budget_of_real_steps_is_kept_exactly():

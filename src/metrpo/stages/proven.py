@@ -56,7 +56,9 @@ def prove(config: Config, task: Task, before: State, progress: Progress, log: Lo
 
     Fewer than the config asks for where the environment fails, or where the iteration has no room for them.
     """
-    if not (room := steps_kept_for_proof(config, task, before.real_steps)):
+    room = steps_kept_for_proof(config, task, before.real_steps)
+    # Another program may have handed over more episodes than the iteration asked for.
+    if not room or budget.steps_left(config, candidate.real_steps) < room:
         return []
     progress.stage("prove", room)
     iteration, episodes = candidate.iteration, log.proofs()

@@ -21,7 +21,6 @@ from metrpo.policy.gaussian import Policy
 from metrpo.policy.inputs import Inputs, folded, unfolded
 from metrpo.seeds import Stage, rng_of
 from metrpo.stages.log import Log, Unkept, left_out
-from metrpo.stages.proven import steps_kept_for_proof
 from metrpo.stages.state import State, inputs_for, on_host
 from metrpo.types import Episode
 from metrpo.world import collect as real
@@ -36,19 +35,18 @@ def collect(
     progress: Progress = SILENT,
     log: Log | None = None,
     at_least: int | None = None,
+    kept: int = 0,
 ) -> list[Episode]:
     """The real episodes of the next iteration: those that wait in `log`, and more until they have enough steps.
 
-    Enough are `at_least`, or as many as the config asks for and its budget allows, less those that are kept for trying
-    the next policy (`stages.proven`); an episode of more steps than the
-    config asks for is cut there, and so is the one that reaches the end of the budget. New ones go to `log` as they
-    end; what a run that was stopped has collected is not collected again.
+    Enough are `at_least`, or as many as the config asks for and its budget allows, less those `kept` for something
+    else. An episode of more steps than the config asks for is cut there, and so is the one that reaches the end of the
+    budget. New ones go to `log` as they end; what a run that was stopped has collected is not collected again.
 
     An episode in which the environment gives NaN or infinity is left out for good: its seed would give the same again.
     So is one that fails otherwise, but in its second try: the first ends the run. Raises `UnplayableError` when too
     many are left out, `EpisodeError` for another failure.
     """
-    kept = steps_kept_for_proof(config, task, state.real_steps)
     enough = budget.steps_wanted(config, state.real_steps) - kept if at_least is None else at_least
     at_most = budget.steps_left(config, state.real_steps) - kept if at_least is None else math.inf
     progress.stage("collect", enough)
