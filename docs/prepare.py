@@ -1,22 +1,28 @@
 """Prepares the documentation for the site generator: `python docs/prepare.py` writes `build/docs` (see `make docs`).
 
 The pages are read on a code host as they are, with links from `docs/` into the whole tree. A site holds `docs/` alone,
-so here every such link is checked and given a place in the site. And two comments are filled in:
+so here every such link is checked and given a place in the site. And three comments are filled in:
 
     <!-- from README.md: The loop -->     a section of a file of the tree (without a name: all of it)
     <!-- commands -->                     every command's --help, from the parser itself
+    <!-- settings -->                     a table for each group of settings, from their definitions
 
 Nothing here knows the generator: it finds plain Markdown, and whatever is wrong has been said before, with its line.
 """
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import dataclasses
+import inspect
 import io
+import itertools
 import os
 import re
 import shutil
 import sys
+import textwrap
 import typing
 from pathlib import Path
 from typing import NamedTuple
@@ -172,6 +178,60 @@ def _command(name: str, text: str) -> str:
     return f'{shown}\n??? note "Every option"\n\n{folded}\n'
 
 
+def settings() -> str:
+    """A table for each group of settings: what each one is, and its value in the presets.
+
+    A preset's cell is empty where it has the default. What presets set for single tasks stands in a last table.
+    """
+    from metrpo import config, presets
+
+    chosen = {"fast": presets.FAST_ALL, "long-horizon": presets.FAST_ALL | presets.LONG_HORIZON_ALL}
+    groups = [field for field in dataclasses.fields(config.Config) if field.default_factory is not dataclasses.MISSING]
+    tables = [_settings_table("The run", "", config.Config, chosen)]
+    tables += [_settings_table(f"`{group.name}`", f"{group.name}.", group.default_factory, chosen) for group in groups]
+    own = (("paper", presets.PAPER), ("fast", presets.FAST))
+    rows = [
+        (task, name, ", ".join(f"`{setting}` {_shown(value)}" for setting, value in row.items()))
+        for name, table in own
+        for task, row in table.items()
+    ]
+    tables.append("## Single tasks\n\n" + _table(("task", "preset", "has"), rows))
+    return "\n".join(tables)
+
+
+def _settings_table(title: str, prefix: str, group: type, presets: dict[str, dict[str, object]]) -> str:
+    rows, texts = [], _field_texts(group)
+    for field in dataclasses.fields(group):
+        if field.default_factory is dataclasses.MISSING:
+            name, default = prefix + field.name, field.default
+            shown = "required" if default is dataclasses.MISSING else _shown(default)
+            values = [preset.get(name, default) for preset in presets.values()]
+            cells = ("" if value == default else _shown(value) for value in values)
+            rows.append((f"`{name}`", shown, *cells, texts[field.name]))
+    return f"## {title}\n\n{group.__doc__}\n\n" + _table(("setting", "default", *presets, "what it is"), rows)
+
+
+def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+    lines = (head, ["---"] * len(head), *rows)
+    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, tuple):
+        return "-".join(map(str, value)) or "none"
+    return "none" if value is None else {"True": "yes", "False": "no"}.get(str(value), str(value))
+
+
+def _field_texts(group: type) -> dict[str, str]:
+    """What stands below each field in the source, on one line."""
+    body = ast.parse(textwrap.dedent(inspect.getsource(group))).body[0].body
+    return {
+        field.target.id: " ".join(text.value.value.split())
+        for field, text in itertools.pairwise(body)
+        if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr)
+    }
+
+
 def main() -> int:
     """Writes build/docs, or says what is wrong with the pages and returns 1."""
     found = re.search(r"^  repository: *(\S+)", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
@@ -181,7 +241,9 @@ def main() -> int:
     shutil.copytree(DOCS, out, ignore=shutil.ignore_patterns("*.md", "*.py", "__pycache__"))
     for page in sorted(DOCS.glob("*.md")):
         text = with_includes(page, rendered(page, links, repository), links, repository)
-        (out / page.name).write_text(re.sub(r"^<!-- commands -->$", lambda _: commands(), text, flags=re.MULTILINE))
+        for made in (commands, settings):
+            text = re.sub(rf"^<!-- {made.__name__} -->$", lambda _, made=made: made(), text, flags=re.MULTILINE)
+        (out / page.name).write_text(text)
     for image in links.images:
         copy = out / "tree" / image.relative_to(ROOT)
         copy.parent.mkdir(parents=True, exist_ok=True)
