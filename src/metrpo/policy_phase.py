@@ -49,6 +49,8 @@ class PhaseInfo(NamedTuple):
     """Mean over the updates."""
     diverged: float
     """Share of imagined rollouts, mean over the updates."""
+    restarted: bool = False
+    """Whether it began with a fresh policy, which the models prefer to the one that the run had."""
 
 
 class Starts(NamedTuple):

@@ -50,6 +50,7 @@ FAST_ALL: Overrides = {
     "policy.mean_penalty": 1.0,
     "policy.min_std": 0.2,
     "policy.normalise": True,
+    "policy.restart_every": 3,
     "validate.max_updates": 100,
     "validate.real_episodes": 4,
     "validate.starts": 50,
@@ -82,6 +83,7 @@ LONG_HORIZON_ALL: Overrides = {
     "imagine.steps": 12_000,
     "iterations": 20,
     "policy.initial_std": 0.5,
+    "policy.restart_every": 0,
     "validate.max_updates": 40,
     "validate.starts": 100,
 }

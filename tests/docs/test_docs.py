@@ -8,6 +8,7 @@ else is as printed. A block that cannot run here says why: `<!-- not run: REASON
 from __future__ import annotations
 
 import json
+import pkgutil
 import re
 import runpy
 import shutil
@@ -174,6 +175,22 @@ def test_the_reference_is_complete():
     assert re.findall(r"^## metrpo (\w+)$", text, re.MULTILINE) == list(command_table.NAMES)
     assert "--ensemble.members INT" in text
     assert not set(text) & set("╭╮╰╯│")
+
+
+def test_the_ways_through_the_code_name_what_is_there():
+    page = (ROOT / "docs" / "concepts.md").read_text()
+    ways = prepare["section"](page, "Three ways through the code")
+    names = re.findall(
+        r"^ *((?:\w+\.)+\w+)", "\n".join(re.findall(r"```text\n(.*?)```", ways, re.DOTALL)), re.MULTILINE
+    )
+    assert len(names) > 30
+    missing = []
+    for name in names:
+        try:
+            pkgutil.resolve_name(f"metrpo.{name}")
+        except (ImportError, AttributeError):
+            missing.append(name)
+    assert not missing
 
 
 def test_every_setting_has_a_row_with_its_values_and_its_text():

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from copy import deepcopy
 
+import jax
 import numpy as np
+from jaxtyping import Float
 
 from metrpo import policy_phase
 from metrpo.config import Config
@@ -13,13 +16,16 @@ from metrpo.finite import naming
 from metrpo.model.ensemble import Ensemble
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
-from metrpo.policy.value.table import Baseline
+from metrpo.policy.inputs import folded
+from metrpo.policy.stopping import most_improve
+from metrpo.policy.value.table import Baseline, init_baseline
 from metrpo.policy_phase import Hooks, PhaseInfo, Starts, simulator_of
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.stages.records import recorded_returns
 from metrpo.stages.state import State, inputs_for
 from metrpo.world import collect as real
+from metrpo.world.dataset import Dataset
 from metrpo.world.origin import relative, shifted
 from metrpo.world.task import Task
 
@@ -29,18 +35,14 @@ def improve_policy(
 ) -> tuple[Policy, Baseline, PhaseInfo]:
     """The policy phase (`metrpo.policy_phase`): the accepted policy, its baseline and what happened.
 
-    `state` holds the dataset that the ensemble was fitted to.
+    `state` holds the dataset that the ensemble was fitted to. Where it is an iteration for that, a fresh policy has a
+    phase as well, and the models vote between the two.
     """
     iteration, dataset = state.iteration + 1, state.dataset
-    rng, starts = rng_of(config.seed, iteration, Stage.IMPROVE), dataset.starts
-    simulator = simulator_of(config, shifted(task, dataset.origin), ensemble, inputs_for(config, task, dataset))
-    if config.imagine.start == "anywhere":
-        starts = dataset.train.states
-    if config.imagine.start == "reset":
-        with naming("improve", iteration):
-            rollouts = policy_phase.rollouts_for(config.imagine.steps, simulator.horizon)
-            starts = real.reset_states(task, max(config.validate.starts, rollouts), rng)
-        starts = relative(starts, dataset.origin).astype(np.float32)
+    rng = rng_of(config.seed, iteration, Stage.IMPROVE)
+    inputs = inputs_for(config, task, dataset)
+    simulator = simulator_of(config, shifted(task, dataset.origin), ensemble, inputs)
+    starts = _starts(config, task, dataset, iteration, simulator.horizon, rng)
 
     def oracle(policy: Policy) -> float:
         # A policy in which the environment fails is no improvement, and the next iteration has other starts. They are
@@ -50,15 +52,42 @@ def improve_policy(
     def tell(updates: int, accepted: int, value: float) -> None:
         progress.update(updates, f"accepted {accepted}, imagined return {value:.2f}")
 
-    return policy_phase.improve(
-        config,
-        simulator,
-        _with_std(config, state),
-        state.baseline,
-        Starts(starts, rng),
-        key_of(config.seed, iteration, Stage.IMPROVE),
-        Hooks(clock, tell, oracle),
-    )
+    def phase(policy: Policy, baseline: Baseline, stage: Stage) -> tuple[Policy, Baseline, PhaseInfo]:
+        # Every phase draws the same start states, so that the models can compare what they end with.
+        began, key = Starts(starts, deepcopy(rng)), key_of(config.seed, iteration, stage)
+        return policy_phase.improve(config, simulator, policy, baseline, began, key, Hooks(clock, tell, oracle))
+
+    found = phase(_with_std(config, state), state.baseline, Stage.IMPROVE)
+    if not config.policy.restart_every or iteration % config.policy.restart_every:
+        return found
+    progress.stage("improve a fresh policy", config.validate.max_updates)
+    policy, baseline = fresh_policy(config, task, iteration, Stage.RESTART)
+    other = phase(policy if inputs is None else folded(policy, inputs), baseline, Stage.RESTART)
+    if not most_improve(other[2].values, found[2].values, config.validate):
+        return found
+    return other[0], other[1], other[2]._replace(restarted=True)
+
+
+def fresh_policy(config: Config, task: Task, iteration: int, stage: Stage) -> tuple[Policy, Baseline]:
+    """A policy that has learned nothing, and its value function."""
+    key = key_of(config.seed, iteration, stage)
+    p = config.policy
+    policy = gaussian.init(key, task.state_size, task.action_size, p.hidden, p.initial_std)
+    return policy, init_baseline(config.advantage, task.state_size, jax.random.fold_in(key, 0))
+
+
+def _starts(
+    config: Config, task: Task, dataset: Dataset, iteration: int, horizon: int, rng: np.random.Generator
+) -> Float[np.ndarray, "E S"]:
+    """Where imagined episodes may start."""
+    if config.imagine.start == "anywhere":
+        return dataset.train.states
+    if config.imagine.start == "dataset":
+        return dataset.starts
+    with naming("improve", iteration):
+        rollouts = policy_phase.rollouts_for(config.imagine.steps, horizon)
+        starts = real.reset_states(task, max(config.validate.starts, rollouts), rng)
+    return relative(starts, dataset.origin).astype(np.float32)
 
 
 def _with_std(config: Config, state: State) -> Policy:
