@@ -1,4 +1,4 @@
-"""The calls between the package's modules in a small run, as a tree: `python benchmarks/tools/ways.py [MODULE.FUNCTION]`.
+"""Calls between the package's modules in a small run, as a tree: `python benchmarks/tools/ways.py [MODULE.FUNCTION]`.
 
 `docs/concepts.md`, "Three ways through the code", is an extract of it. A function is printed when a function of another
 module calls it, and once below each caller. With an argument, only what that function leads to.

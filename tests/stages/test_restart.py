@@ -1,4 +1,4 @@
-"""Every n-th iteration a fresh policy has a phase as well; where the models vote for it, it takes the place of the other."""
+"""Every n-th iteration a fresh policy has a phase as well; where the models vote for it, it is the policy."""
 
 import jax
 import numpy as np
