@@ -16,7 +16,10 @@ from metrpo.stages import policy_search
 from metrpo.world import dataset as datasets
 
 TINY = override(tiny_run.CONFIG, {"ensemble.members": 5})
-OLD = np.array([1.0, 1.0, 1.0, 1.0, 1.0])
+NOTHING = np.full(5, -9.0)
+OLD = np.full(5, 1.0)
+CLEARLY_BETTER = 2.0001
+"""More than OLD by this: 12 from nothing where OLD has 10."""
 
 
 def same(a, b):
@@ -43,7 +46,7 @@ class Phases:
         self.drawn.append(starts.draw(7))
         self.keys.append(jax.random.key_data(key).tolist())
         values = OLD if same(policy.layers, self.state.policy.layers) else self.fresh
-        info = PhaseInfo(values, 5, 5, 0, 1, np.ones(5), 0.0, 0.0)
+        info = PhaseInfo(values, NOTHING, 5, 5, 0, 1, np.ones(5), 0.0, 0.0)
         return policy._replace(log_std=policy.log_std - 1), baseline, info
 
 
@@ -61,10 +64,19 @@ def test_a_fresh_policy_has_a_phase_every_nth_iteration(state, monkeypatch, ever
     assert len(played.began) == phases
 
 
-@pytest.mark.parametrize(("better", "wins"), [(0, False), (3, False), (4, True), (5, True)])
-def test_the_models_vote_between_the_two(state, monkeypatch, better, wins):
-    """At least 70 % of five models are four; a tie is no vote for the new one."""
-    played = Phases(monkeypatch, state, OLD + (np.arange(5) < better))
+@pytest.mark.parametrize(
+    ("models", "more", "wins"),
+    [
+        (5, 0, False),
+        (3, CLEARLY_BETTER, False),
+        (4, CLEARLY_BETTER, True),
+        (5, CLEARLY_BETTER, True),
+        (5, 1.999, False),
+    ],
+)
+def test_the_models_vote_for_what_is_clearly_better(state, monkeypatch, models, more, wins):
+    """At least 70 % of five models are four, and a fifth more from nothing is clear."""
+    played = Phases(monkeypatch, state, OLD + more * (np.arange(5) < models))
     policy, _, info = search(state, 3)
     assert info.restarted == wins
     assert same(policy.layers, played.began[wins].layers)
@@ -84,7 +96,7 @@ def test_both_are_judged_from_the_same_start_states_and_the_first_is_what_it_was
 
 def test_a_fresh_policy_brings_no_parameter_noise(state, monkeypatch):
     """It has no last change that could say how wide the noise should be."""
-    for fresh, restarted in ((OLD + 1, True), (OLD - 1, False)):
+    for fresh, restarted in ((OLD + 3, True), (OLD - 1, False)):
         Phases(monkeypatch, state, fresh)
         config = override(TINY, {"policy.restart_every": state.iteration + 1})
         following, row = algorithm.step(config, probe.PROBE, state)

@@ -145,8 +145,8 @@ class PolicyConfig:
     """Taken from the surrogate of trpo, ppo and vpg: this times the squared excess of mean actions beyond 0.9, over the
     standard deviation."""
     restart_every: int = 0
-    """Every n-th iteration improves a fresh policy, too, which takes the place of the other where the models vote for
-    it: a way out of a local optimum. 0: never."""
+    """Every n-th iteration improves a fresh policy, too. It takes the place of the other where the models say that it
+    learned a fifth more: a way out of a local optimum. 0: never."""
 
     def __post_init__(self) -> None:
         require(all(n >= 1 for n in self.hidden), "policy.hidden", self.hidden, "sizes of at least 1")

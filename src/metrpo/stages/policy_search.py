@@ -29,6 +29,8 @@ from metrpo.world.dataset import Dataset
 from metrpo.world.origin import relative, shifted
 from metrpo.world.task import Task
 
+CLEARLY = 1.2
+
 
 def improve_policy(
     config: Config, task: Task, state: State, ensemble: Ensemble, progress: Progress, clock: Clock
@@ -63,9 +65,17 @@ def improve_policy(
     progress.stage("improve a fresh policy", config.validate.max_updates)
     policy, baseline = fresh_policy(config, task, iteration, Stage.RESTART)
     other = phase(policy if inputs is None else folded(policy, inputs), baseline, Stage.RESTART)
-    if not most_improve(other[2].values, found[2].values, config.validate):
-        return found
-    return other[0], other[1], other[2]._replace(restarted=True)
+    return (*other[:2], other[2]._replace(restarted=True)) if _is_preferred(config, other[2], found[2]) else found
+
+
+def _is_preferred(config: Config, fresh: PhaseInfo, other: PhaseInfo) -> bool:
+    """Whether the models vote for the policy of the `fresh` phase: it learned `CLEARLY` times what the other knows.
+
+    Both gains are measured from the policy that knows nothing: neither the size nor the origin of rewards matters.
+    A little more is no reason: a policy that is new to the data is promised too much.
+    """
+    nothing = fresh.first_values
+    return most_improve(fresh.values - nothing, CLEARLY * (other.values - nothing), config.validate)
 
 
 def fresh_policy(config: Config, task: Task, iteration: int, stage: Stage) -> tuple[Policy, Baseline]:
