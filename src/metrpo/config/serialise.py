@@ -20,6 +20,7 @@ ADDED = (
     "config.policy.normalise",
     "config.policy.min_std",
     "config.policy.mean_penalty",
+    "config.policy.restart_every",
     "config.imagine.horizon",
     "config.imagine.products",
     "config.imagine.disagreement",
