@@ -16,16 +16,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from metrpo import config, get_task, init
+from metrpo import config, init
 from metrpo.model import ensemble as ensembles
 from metrpo.policy import gaussian
 from metrpo.run.checkpoint import load_state
 from metrpo.types import Episode
 from metrpo.world.collect import collect
+from metrpo.world.registry import task_for
 
 
 def relative_error(ensemble: ensembles.Ensemble, episodes: list[Episode], steps: int) -> np.ndarray:
-    """[S]: error after `steps` predicted steps, over the error of standing still; mean over starts and members."""
+    """[O]: error after `steps` predicted steps, over the error of standing still; mean over starts and members."""
     starts, actions, ends = [], [], []
     for e in episodes:
         for t in range(len(e.actions) - steps + 1):
@@ -36,8 +37,9 @@ def relative_error(ensemble: ensembles.Ensemble, episodes: list[Episode], steps:
     for step in range(steps):
         action = jnp.array(actions)[:, step]
         states = ensembles.predict(ensemble, states, jnp.broadcast_to(action, (ensemble.members, *action.shape)))
-    error = np.asarray(states) - np.array(ends)
-    still = np.array(starts) - np.array(ends)
+    observed = np.s_[..., : len(starts[0]) - len(ensemble.carried.indices)]
+    error = (np.asarray(states) - np.array(ends))[observed]
+    still = (np.array(starts) - np.array(ends))[observed]
     return np.sqrt(np.mean(error**2, axis=(0, 1)) / np.mean(still**2, axis=0))
 
 
@@ -48,12 +50,12 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=20)
     arguments = parser.parse_args()
     settings = config.from_json((arguments.run_dir / "config.json").read_text())
-    task = get_task(settings.task)
+    task = task_for(settings)
     newest = sorted((arguments.run_dir / "checkpoints").glob("*.npz"))[-1]
     state, _ = load_state(newest, init(settings))
     e = settings.ensemble
     normaliser = ensembles.normaliser_of(state.dataset.train, e.std_floor, e.delta_std_floor, task.unseen)
-    ensemble = ensembles.Ensemble(state.networks, normaliser)
+    ensemble = ensembles.Ensemble(state.networks, normaliser, ensembles.Carried(task.carried))
     act = partial(gaussian.mean, jax.tree.map(np.asarray, state.policy))
     noise = dataclasses.replace(settings.collect, steps=arguments.episodes * task.horizon)
     episodes = collect(task, lambda _: act, noise, np.random.default_rng(2**40))

@@ -86,6 +86,7 @@ OURS = {
     "preset": ("paper", "the label"),
     "seed": (0, "any will do"),
     "data": (None, "nothing is logged elsewhere"),
+    "history": (1, "the paper's states are one observation"),
     "max_action": (1.0, "the environment's range is the only limit"),
     "max_change": (None, "the paper knows none: off"),
     "env_kwargs": ((), "the paper's tasks take none"),

@@ -106,7 +106,7 @@ def learn(
     iteration = state.iteration + 1
     clock = clock or Clock()
     rng = rng_of(config.seed, iteration, Stage.SPLIT)
-    dataset = datasets.add(state.dataset, episodes, config.collect, rng, task.learned)
+    dataset = datasets.add(state.dataset, episodes, config.collect, rng, task.learned, task.carried)
     require_finite("collect", iteration, "leave out the episode that holds it", dataset=dataset)
     if state.iteration == 0:
         scales.warn(config, task, dataset, episodes)
@@ -151,10 +151,10 @@ def _before(state: State, policy: Policy, improved: PhaseInfo) -> Policy:
 
 def _logged(config: Config, task: Task) -> Dataset:
     """The dataset before the first iteration: what was logged elsewhere, or nothing."""
-    nothing = datasets.empty(task.state_size, task.action_size, len(task.learned))
+    nothing = datasets.empty(task.state_size, task.action_size, task.predicted)
     if config.data is None:
         if config.real_steps == 0:
             raise ConfigError("real_steps: expected at least 1 without logged transitions to learn from (data), got 0")
         return nothing
     rng = rng_of(config.seed, 0, Stage.SPLIT)
-    return datasets.add(nothing, offline_data.load(config.data, task), config.collect, rng, task.learned)
+    return datasets.add(nothing, offline_data.load(config.data, task), config.collect, rng, task.learned, task.carried)

@@ -17,6 +17,7 @@ from metrpo.run.task_file import task_of_run
 from metrpo.run.video import record
 from metrpo.safe_load import brief
 from metrpo.world import collect
+from metrpo.world.history_env import with_history
 from metrpo.world.registry import get_task, limited
 from metrpo.world.task import Task
 from metrpo.zoo import FOLDER, located
@@ -83,7 +84,8 @@ def evaluate(
         known = of_run or get_task(made.task, made.env_kwargs, made.imports)
     if isinstance(act, LoadedPolicy):
         _require_fit(act, known)
-        known, act = limited(known, Limits.of(act.info)), act.unlimited
+        known = with_history(limited(known, Limits.of(act.info)), act.info.history)
+        act = act.of_state
     return EvaluationResult(known.name, seed, collect.evaluate(known, act, episodes, seed))
 
 

@@ -58,21 +58,25 @@ def named(task: Task, dimension: int) -> str:
 
 
 def findings(config: Config, task: Task, dataset: Dataset, episodes: list[Episode]) -> list[Found]:
-    """What there is to say about the training data and the `episodes` that they are from, if these are at hand."""
-    states = dataset.train.states[-_ROWS:].astype(np.float64)
+    """What there is to say about the training data and the `episodes` that they are from, if these are at hand.
+
+    Of a state with a history about its newest observation: the others are its copies.
+    """
+    newest = task.layout.newest
+    states = newest(dataset.train.states[-_ROWS:]).astype(np.float64)
     if not len(states):
         return []
-    change = _change(dataset, episodes)
-    checks = (_coarse(states, change), _rounded(dataset.origin, episodes, change), _exploded(states))
+    observed = [newest(e.states) for e in episodes]
+    change = _change(dataset, observed, states.shape[1])
+    checks = (_coarse(states, change), _rounded(newest(dataset.origin), observed, change), _exploded(states))
     unnormalised = () if config.policy.normalise else (_far_from_1(states, task), _hidden(config, states, task))
     return [found for found in (*checks, *unnormalised) if found.dimensions]
 
 
-def _change(dataset: Dataset, episodes: list[Episode]) -> np.ndarray:
-    """[S], root mean square of the changes in one step; 0 where nothing changes."""
-    size = dataset.train.states.shape[1]
+def _change(dataset: Dataset, observed: list[np.ndarray], size: int) -> np.ndarray:
+    """[O], root mean square of the changes in one step; 0 where nothing changes."""
     kept = dataset.train.deltas[-_ROWS:, :size].astype(np.float64)
-    changes = [np.diff(e.states.astype(np.float64), axis=0) for e in episodes] or [kept]
+    changes = [np.diff(x.astype(np.float64), axis=0) for x in observed] or [kept]
     return np.sqrt(np.mean(np.square(np.concatenate(changes)), axis=0))
 
 
@@ -92,9 +96,9 @@ def _coarse(states: np.ndarray, change: np.ndarray) -> Found:
     )
 
 
-def _rounded(origin: np.ndarray, episodes: list[Episode], change: np.ndarray) -> Found:
+def _rounded(origin: np.ndarray, observed: list[np.ndarray], change: np.ndarray) -> Found:
     """Where there is an origin, but what was observed came in float32: the digits were lost before."""
-    exact = np.concatenate([e.states for e in episodes] or [origin[None]])
+    exact = np.concatenate(observed or [origin[None]])
     apart = _apart(np.abs(exact).max(axis=0))
     in_float32 = np.all(exact == exact.astype(np.float32), axis=0)
     dimensions = _where((origin != 0) & in_float32 & (change > 0) & (apart > COARSE * change))

@@ -34,8 +34,8 @@ class Transitions(NamedTuple):
     """Counted from the dataset's origin."""
     actions: Float[Array, "C A"]
     deltas: Float[Array, "C D"]
-    """What the models predict: the change of state [S]; then, where they are learned, the reward, and 1 where the task
-    ended the episode, else 0."""
+    """What the models predict: the change of state, without what is carried over of a history (`metrpo.history`);
+    then, where they are learned, the reward, and 1 where the task ended the episode, else 0."""
     size: Int[Array, ""] | int
     """n (a scalar array on the device)."""
 

@@ -109,6 +109,7 @@ IMPOSSIBLE = {
     "iterations": [0, -3],
     "real_steps": [-1],
     "evaluation_episodes": [0],
+    "history": [0, -1],
     "max_action": [0.0, 1.5, float("nan")],
     "max_change": [0.0, -0.1, float("inf")],
     "collect.steps": [0],

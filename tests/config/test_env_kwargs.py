@@ -10,6 +10,7 @@ from metrpo.commands.parse import parse
 from metrpo.config import Config, difference, from_json, to_json
 from metrpo.config.env_kwargs import canonical, keywords
 from metrpo.errors import ConfigError, RunDirectoryError, TaskError
+from metrpo.history import History
 from metrpo.launch.grid import Grid
 from metrpo.presets import override, preset
 from metrpo.run.directory import RunDirectory
@@ -55,7 +56,7 @@ def test_arguments_are_part_of_a_runs_settings(tmp_path):
     assert str(default_run_dir(config)) == "runs/Pendulum-v1-fast-seed0-env_kwargs=g-5.0"
     RunDirectory(tmp_path / "run", config).close()
     with RunDirectory(tmp_path / "run", config) as run:
-        run.episodes.widths = (3, 1)
+        run.episodes.layout = History(1, 3, 1)
         run.path.joinpath("metrics.csv").write_text("iteration\n1\n")
     with pytest.raises(RunDirectoryError, match="env_kwargs"):
         RunDirectory(tmp_path / "run", preset("Pendulum-v1", env_kwargs={"g": 9.0}))

@@ -33,6 +33,7 @@ from metrpo import config as configs
 from metrpo import safe_load, training
 from metrpo.config import Config
 from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError, TaskError
+from metrpo.history import History
 from metrpo.presets import override
 from metrpo.run import directory, lock
 from metrpo.run.checkpoint import load_state
@@ -75,7 +76,7 @@ def _load_checkpoint(path):
 
 def _load_episode(path):
     log = EpisodeLog(path.parent.parent)
-    log.widths = (2, 2)
+    log.layout = History(1, 2, 2)
     return log.pending()
 
 

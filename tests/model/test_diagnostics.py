@@ -56,7 +56,7 @@ def test_errors_are_those_of_a_slow_rollout(data):
     wrong = A + np.array([[0.0, 0.0], [0.0, 0.01]])
     held_out, _ = data
     found = of([(A, B), (wrong, B)], data)
-    rows, follow = _starts(held_out, LENGTH)
+    rows, follow = _starts(held_out, held_out.states.shape[1], LENGTH)
     for k, error in found.errors.items():
         squares, still = [], []
         for row in rows[follow >= k]:
@@ -73,7 +73,7 @@ def test_errors_are_those_of_a_slow_rollout(data):
 
 def test_predictions_never_run_over_the_end_of_an_episode(data):
     held_out, _ = data
-    rows, follow = _starts(held_out, LENGTH)
+    rows, follow = _starts(held_out, held_out.states.shape[1], LENGTH)
     assert len(rows) == 100
     np.testing.assert_array_equal(follow, LENGTH - rows % LENGTH)
     assert (rows % LENGTH == 0).sum() >= 50, "whole episodes are predicted, too"

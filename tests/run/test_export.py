@@ -292,7 +292,7 @@ def test_the_self_check_fails_when_the_action_differs(tmp_path):
     (tmp_path / "other.py").write_text(source.replace("np.tanh(", "np.sin("))
     ran = subprocess.run([sys.executable, "-I", tmp_path / "other.py"], capture_output=True, text=True)
     assert ran.returncode == 1
-    assert "expected the action [" in ran.stderr
+    assert "expected the actions [[" in ran.stderr
 
 
 @pytest.mark.parametrize("position", [0, 1000, -2])

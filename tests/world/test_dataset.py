@@ -69,7 +69,7 @@ def test_the_share_is_that_of_the_episodes_but_for_one_on_either_side(fraction, 
 
 def test_an_empty_dataset_has_a_column_for_each_thing_to_be_predicted():
     for learned in (0, 1, 2):
-        nothing = datasets.empty(3, 2, learned)
+        nothing = datasets.empty(3, 2, 3 + learned)
         for t in (nothing.train, nothing.validation):
             assert [x.shape for x in t[:3]] == [(0, 3), (0, 2), (0, 3 + learned)]
             assert t.size == 0

@@ -385,7 +385,7 @@ def test_the_dataset_holds_reward_and_end_where_they_are_learned():
     ]
     config = CollectConfig(validation_fraction=0.4)
     for learned in ((), ("reward",), ("end",), ("reward", "end")):
-        dataset = datasets.add(datasets.empty(4, 2, len(learned)), episodes, config, rng, learned)
+        dataset = datasets.add(datasets.empty(4, 2, 4 + len(learned)), episodes, config, rng, learned)
         for t in (dataset.train, dataset.validation):
             assert t.deltas.shape == (t.size, 4 + len(learned))
             assert t.deltas.dtype == np.float32

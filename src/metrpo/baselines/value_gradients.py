@@ -23,7 +23,7 @@ from metrpo.config import Config, FitConfig, GradientConfig, SVGConfig
 from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import ConfigError
 from metrpo.model import ensemble as ensembles
-from metrpo.model.ensemble import Ensemble, Networks, predict
+from metrpo.model.ensemble import Carried, Ensemble, Networks, predict
 from metrpo.model.epochs import loss_of, minibatch
 from metrpo.policy import gaussian
 from metrpo.policy.advantage import discounted_returns
@@ -84,7 +84,7 @@ def init(config: Config, task: Task) -> State:
         raise ConfigError(f"method: svg needs the reward of {task.name} as a formula, got a task that learns it")
     keys = jax.random.split(key_of(config.seed, 0, Stage.INIT), 3)
     policy = gaussian.init(keys[0], task.state_size, task.action_size, p.hidden, p.initial_std)
-    networks = ensembles.init(keys[1], 1, task.state_size, task.action_size, e.hidden)
+    networks = ensembles.init(keys[1], 1, task.state_size, task.action_size, e.hidden, task.observation_size)
     value = gaussian.init(keys[2], task.state_size + 1, 1, _VALUE_HIDDEN, 1.0)
     return State(
         iteration=0,
@@ -95,7 +95,7 @@ def init(config: Config, task: Task) -> State:
         model_moments=optax.adam(config.fit.learning_rate).init(networks),
         value=value,
         value_moments=optax.adam(config.svg.value_learning_rate).init(value),
-        replay=datasets.empty(task.state_size, task.action_size).train,
+        replay=datasets.empty(task.state_size, task.action_size, task.observation_size).train,
     )
 
 
@@ -111,7 +111,9 @@ def step(config: Config, task: Task, state: State, progress: Progress = SILENT) 
         with clock("collect"):
             drawn = on_policy.collect(task, state.policy, 1, rng, longest=config.collect.steps, at_most=left - steps)
             collected += drawn.episodes
-            state = state._replace(replay=datasets.append(state.replay, drawn.episodes, config.collect.max_train))
+            most = config.collect.max_train
+            replay = datasets.append(state.replay, drawn.episodes, most, carried=task.carried)
+            state = state._replace(replay=replay)
             path = _path(drawn.episodes[0].states, drawn.actions[0], drawn.episodes[0].rewards, task.horizon)
         normaliser = _normaliser(config, task, state.replay)
         with clock("fit"):
@@ -252,7 +254,7 @@ def _improve(
     learned, norm, made = _train_policy(
         PolicySettings(config.svg, config.gradient, config.advantage.discount),
         task,
-        Ensemble(state.networks, normaliser),
+        Ensemble(state.networks, normaliser, Carried(task.carried)),
         (state.policy, state.policy_moments, state.value, state.value_moments),
         path,
     )

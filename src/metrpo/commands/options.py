@@ -45,6 +45,9 @@ class RunOptions(Config):
     """Instead of --iterations: go on until this many real steps have been collected; 0: learn from --data alone."""
     data: Annotated[str | None, arg(metavar="FILE")] = None
     """Logged transitions to begin with: minari:NAME or an .npz of states, actions, rewards, next_states, terminated."""
+    history: Annotated[int, arg(metavar="N")] = 1
+    """How many of the last observations policy and models see, with the actions between them: 3 for actions that come
+    two steps late, or where no sensor shows velocities."""
     run_dir: Annotated[Path | None, arg(metavar="DIR")] = None
     """Where the run lives; default: runs/TASK-[SYSTEM-]PRESET-seedSEED, and the settings that are not the preset's."""
     device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="{cpu,gpu}")] = None
@@ -74,6 +77,7 @@ FEW = frozenset(
         "data",
         "learn_reward",
         "env_kwargs",
+        "history",
         "track",
         "evaluation_episodes",
         "run_dir",

@@ -373,6 +373,9 @@ class Config:
     max_change: float | None = None
     """Most that an action changes from one step to the next, in the same units; from the middle of the range at the
     start of an episode. Whoever plays the policy's file is held to both. None: any."""
+    history: int = 1
+    """Observations that policy and models see at each step: the newest, the older ones, and the actions between them.
+    1: the newest alone. 3, say, makes an action delay of two steps, and velocities that no sensor shows, learnable."""
     evaluation_episodes: int = 20
     """Real episodes of the deterministic policy that `return_real` averages; a report, never used to learn."""
     deterministic: bool = False
@@ -400,6 +403,7 @@ class Config:
         require(0 < self.max_action <= 1, "max_action", self.max_action, "above 0 and at most 1")
         change = self.max_change
         require(change is None or positive(change), "max_change", change, "a finite number > 0")
+        require(self.history >= 1, "history", self.history, "at least 1")
         require(self.evaluation_episodes >= 1, "evaluation_episodes", self.evaluation_episodes, "at least 1")
 
 

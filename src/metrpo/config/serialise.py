@@ -41,6 +41,7 @@ ADDED = (
     "config.imports",
     "config.max_action",
     "config.max_change",
+    "config.history",
     "config.learn_reward",
     "config.trust_reward",
 )

@@ -32,15 +32,15 @@ _LONGEST = 200
 class Diagnosis(NamedTuple):
     """What the models are worth on real episodes that they were not trained on, and in imagination."""
 
-    errors: dict[int, Float[np.ndarray, "S"]]
-    """After k steps: root mean square error of the open-loop prediction over that of predicting no change, each
-    member by itself; 1 is no better than that, NaN where no held-out episode is so long."""
+    errors: dict[int, Float[np.ndarray, "O"]]
+    """After k steps, of each number observed: root mean square error of the open-loop prediction over that of
+    predicting no change, each member by itself; 1 is no better than that, NaN where no held-out episode is so long."""
     disagreement_real: float
     """Mean spread of the members' predictions on held-out transitions (`imagine.disagreement`)."""
     disagreement_imagined: float
     """The same along imagined episodes of the policy: far above the real one, it has gone where the models guess."""
     outside: float
-    """Share of these imagined states that leave the range of the training data in any dimension."""
+    """Share of these imagined observations that leave the range of the training data in any dimension."""
     saturated: float
     """Share of the policy's mean actions there that lie beyond [-1, 1], to which they are clipped."""
 
@@ -56,9 +56,9 @@ class Diagnosis(NamedTuple):
         return overall | rest | each
 
 
-def unknown(state_size: int, horizon: int) -> Diagnosis:
+def unknown(observation_size: int, horizon: int) -> Diagnosis:
     """A diagnosis that could not be made, of NaN; its columns are those of one that was."""
-    errors = {k: np.full(state_size, np.nan) for k in _steps(horizon)}
+    errors = {k: np.full(observation_size, np.nan) for k in _steps(horizon)}
     return Diagnosis(errors, **dict.fromkeys(Diagnosis._fields[1:], math.nan))
 
 
@@ -76,28 +76,33 @@ def diagnose(
     (at most 200) start in held-out states.
     """
     length = min(horizon, _LONGEST)
-    size = train.states.shape[1]
-    rows, steps = _starts(held_out, length)
+    size = train.states.shape[1] - len(ensemble.carried.indices)
+    rows, steps = _starts(held_out, size, length)
     actions = np.asarray(held_out.actions)[np.minimum(rows[:, None] + np.arange(length), len(held_out.actions) - 1)]
     starts = np.asarray(held_out.states)[rows]
     # From the host: where arrays lie is no reason to compile anew.
     on_host = jax.device_get((ensemble, policy))
     predicted, spread, imagined, guessed, beyond = jax.device_get(_rollouts(*on_host, starts, actions, key))
-    after = np.asarray(held_out.states) + np.asarray(held_out.deltas)[:, :size]
+    after = _observed(held_out, size)[1]
     errors = {}
     for k in _steps(horizon):
         there = steps >= k
         ends = after[np.minimum(rows + k - 1, len(after) - 1)][there]
-        errors[k] = _relative(predicted[k - 1][:, there], starts[there], ends)
-    low, high = train.states.min(0), train.states.max(0)
-    outside = ~np.all((imagined >= low) & (imagined <= high), axis=-1)  # also where it is no number
+        errors[k] = _relative(predicted[k - 1][:, there, :size], starts[there, :size], ends)
+    seen, imagined = train.states[:, :size], imagined[..., :size]
+    outside = ~np.all((imagined >= seen.min(0)) & (imagined <= seen.max(0)), axis=-1)  # also where it is no number
     return Diagnosis(errors, float(spread.mean()), float(guessed.mean()), float(outside.mean()), float(beyond.mean()))
 
 
-def _starts(t: Transitions, length: int) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]:
-    """Rows to start from, and how many steps of the same episode follow each."""
-    size = t.states.shape[1]
-    states, after = np.asarray(t.states), np.asarray(t.states) + np.asarray(t.deltas)[:, :size]
+def _observed(t: Transitions, size: int) -> tuple[Float[np.ndarray, "n {size}"], Float[np.ndarray, "n {size}"]]:
+    """The observations, of so many numbers, before and after each transition."""
+    now = np.asarray(t.states)[:, :size]
+    return now, now + np.asarray(t.deltas)[:, :size]
+
+
+def _starts(t: Transitions, size: int, length: int) -> tuple[Int[np.ndarray, "N"], Int[np.ndarray, "N"]]:
+    """Rows to start from, and how many steps of the same episode follow each; observations are of `size` numbers."""
+    states, after = _observed(t, size)
     scale = np.abs(states).max(0) + 1e-6
     goes_on = np.all(np.abs(after[:-1] - states[1:]) <= 1e-5 * scale, axis=1)
     firsts = np.concatenate([[0], np.flatnonzero(~goes_on) + 1])

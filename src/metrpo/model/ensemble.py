@@ -6,6 +6,7 @@ would have to be vmapped to the same products, so the forty lines are written ou
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -14,10 +15,20 @@ import numpy as np
 from jax.experimental.layout import Layout, with_layout_constraint
 from jaxtyping import Float, Int, Key
 
+from metrpo.history import runs
 from metrpo.types import Array, Normaliser, Transitions
 
 Networks = tuple[tuple[Float[Array, "K _in _out"], Float[Array, "K 1 _out"]], ...]
 """One (weights, biases) a layer."""
+
+
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Carried:
+    """What of the next state nobody predicts, for it stands in state and action already: a pytree without arrays."""
+
+    indices: tuple[int, ...] = ()
+    """[S - O], within state and action, [S + A]; the next state's last numbers in order (`History.carried`)."""
 
 
 class Ensemble(NamedTuple):
@@ -25,6 +36,7 @@ class Ensemble(NamedTuple):
 
     networks: Networks
     normaliser: Normaliser
+    carried: Carried = Carried()
 
     @property
     def members(self) -> int:
@@ -41,13 +53,18 @@ class Ensemble(NamedTuple):
 
 
 def init(
-    key: Key[Array, ""], members: int, state_size: int, action_size: int, hidden: tuple[int, ...], learned: int = 0
+    key: Key[Array, ""],
+    members: int,
+    state_size: int,
+    action_size: int,
+    hidden: tuple[int, ...],
+    predicted: int | None = None,
 ) -> Networks:
     """Fresh networks: Xavier-uniform weights, zero biases. Member k depends on `key` and k alone, not on K.
 
-    `learned` outputs are added to those of the state.
+    They have as many outputs as numbers are `predicted`; by default those of the state.
     """
-    sizes = (state_size + action_size, *hidden, state_size + learned)
+    sizes = (state_size + action_size, *hidden, predicted or state_size)
 
     def one(k: Int[Array, ""]) -> tuple[tuple[Float[Array, "_in _out"], Float[Array, "1 _out"]], ...]:
         keys = jax.random.split(jax.random.fold_in(key, k), len(sizes) - 1)
@@ -101,6 +118,10 @@ class Predictor(Protocol):
     def normaliser(self) -> Normaliser:
         """Shared by the members."""
 
+    @property
+    def carried(self) -> Carried:
+        """What of the next state they need not predict."""
+
     def outputs(self, x: Float[Array, "K B I"]) -> Float[Array, "K B D"]:
         """What the networks say, each member to its own batch."""
 
@@ -110,19 +131,42 @@ class Predictor(Protocol):
 
 def predict(
     ensemble: Predictor, states: Float[Array, "K B S"], actions: Float[Array, "K B A"]
-) -> Float[Array, "K B D"]:
+) -> Float[Array, "K B P"]:
     """Next states and what else is learned, each member for its own batch."""
+    return with_carried(ensemble, states, actions, predict_changing(ensemble, states, actions))
+
+
+def predict_changing(
+    ensemble: Predictor, states: Float[Array, "K B S"], actions: Float[Array, "K B A"]
+) -> Float[Array, "K B D"]:
+    """As `predict`, without what is carried over."""
     deltas = predict_delta(ensemble, states, actions)
-    size = states.shape[-1]
+    size = states.shape[-1] - len(ensemble.carried.indices)
+    seen = states[..., :size]
     if deltas.shape[-1] == size:
-        return states + deltas
-    return jnp.concatenate([states + deltas[..., :size], deltas[..., size:]], axis=-1)
+        return seen + deltas
+    return jnp.concatenate([seen + deltas[..., :size], deltas[..., size:]], axis=-1)
+
+
+def with_carried(
+    ensemble: Predictor,
+    states: Float[Array, "*batch S"],
+    actions: Float[Array, "*batch A"],
+    changing: Float[Array, "*batch D"],
+) -> Float[Array, "*batch P"]:
+    """Next states and what else is learned, out of what models predict of them and what they leave as it was."""
+    indices = ensemble.carried.indices
+    if not indices:
+        return changing
+    size, now = states.shape[-1] - len(indices), jnp.concatenate([states, actions], axis=-1)
+    rest = [now[..., part] for part in runs(indices)]
+    return jnp.concatenate([changing[..., :size], *rest, changing[..., size:]], axis=-1)
 
 
 def predict_delta(
     ensemble: Predictor, states: Float[Array, "K B S"], actions: Float[Array, "K B A"]
 ) -> Float[Array, "K B D"]:
-    """Changes of state and what else is learned, each member for its own batch."""
+    """Changes of state, without what is carried over, and what else is learned, each member for its own batch."""
     n = ensemble.normaliser
     inputs = jnp.concatenate(
         [(states - n.state_mean) * n.state_scale, (actions - n.action_mean) * n.action_scale], axis=-1

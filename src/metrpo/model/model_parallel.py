@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from metrpo.devices import AXIS, part_of
-from metrpo.model.ensemble import Ensemble, Networks, layer_outputs, network_outputs
+from metrpo.model.ensemble import Carried, Ensemble, Networks, layer_outputs, network_outputs
 from metrpo.types import Array, Normaliser
 
 _UNITS, _INPUTS = 2, 1
@@ -32,6 +32,7 @@ class SharedEnsemble(NamedTuple):
     cut: Networks
     """The members that remain; of every second hidden layer, this device's units."""
     normaliser: Normaliser
+    carried: Carried = Carried()
 
     @property
     def members(self) -> int:
@@ -87,7 +88,7 @@ def shared(ensemble: Ensemble) -> SharedEnsemble:
             biases = part_of(biases, _UNITS) if along == _UNITS else jnp.where(this == 0, biases, 0.0)
         cut.append((weights, biases))
     mine = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, this * own, own), ensemble.networks)
-    return SharedEnsemble(mine, tuple(cut), ensemble.normaliser)
+    return SharedEnsemble(mine, tuple(cut), ensemble.normaliser, ensemble.carried)
 
 
 def _cut_along(layer: int, networks: Networks) -> int | None:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Int, Key
 
-from metrpo.model.ensemble import Predictor, predict
+from metrpo.model.ensemble import Predictor, predict, predict_changing, with_carried
 from metrpo.types import Array
 
 
@@ -48,27 +48,27 @@ class Draw(Protocol):
 
     def __call__(
         self, ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
-    ) -> Float[Array, "N D"]:
+    ) -> Float[Array, "N P"]:
         """The next states first, then what else is learned."""
 
 
 def step_rand(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
-) -> Float[Array, "N D"]:
+) -> Float[Array, "N P"]:
     """One model drawn at random for each state and step (paper, section 5)."""
     return _of_drawn_models(ensemble, states, actions, keys.step)
 
 
 def eps_rand(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
-) -> Float[Array, "N D"]:
+) -> Float[Array, "N P"]:
     """One model drawn at random for each episode."""
     return _of_drawn_models(ensemble, states, actions, keys.episode)
 
 
 def _of_drawn_models(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], key: Key[Array, ""]
-) -> Float[Array, "N D"]:
+) -> Float[Array, "N P"]:
     slots, _ = model_choice(key, states.shape[0], ensemble.members)
     # The blanks repeat the last state; their predictions are dropped.
     grouped = predict(
@@ -79,41 +79,42 @@ def _of_drawn_models(
 
 def one_model(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
-) -> Float[Array, "N D"]:
+) -> Float[Array, "N P"]:
     """The first model, always."""
     return predict(ensemble.first(), states[None], actions[None])[0]
 
 
 def model_mean(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
-) -> Float[Array, "N D"]:
+) -> Float[Array, "N P"]:
     """The mean of all models' predictions."""
-    return jnp.mean(_of_all_models(ensemble, states, actions), axis=0)
+    return with_carried(ensemble, states, actions, jnp.mean(_of_all_models(ensemble, states, actions), axis=0))
 
 
 def model_med(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
-) -> Float[Array, "N D"]:
+) -> Float[Array, "N P"]:
     """The median of all models' predictions, dimension by dimension."""
-    return jnp.median(_of_all_models(ensemble, states, actions), axis=0)
+    return with_carried(ensemble, states, actions, jnp.median(_of_all_models(ensemble, states, actions), axis=0))
 
 
 def model_mean_std(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
-) -> Float[Array, "N D"]:
+) -> Float[Array, "N P"]:
     """Drawn from N(mean, std^2) of all models' predictions, dimension by dimension."""
     predictions = _of_all_models(ensemble, states, actions)
     noise = jax.random.normal(keys.step, predictions.shape[1:])
     # Not jnp.std: where all models agree, its gradient is NaN.
     variance = jnp.mean(jnp.square(predictions - jnp.mean(predictions, axis=0)), axis=0)
     std = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, variance, 1.0)), 0.0)
-    return jnp.mean(predictions, axis=0) + std * noise
+    return with_carried(ensemble, states, actions, jnp.mean(predictions, axis=0) + std * noise)
 
 
 def _of_all_models(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"]
 ) -> Float[Array, "K N D"]:
-    return predict(ensemble, *(for_all(ensemble, x) for x in (states, actions)))
+    # Without what is carried over: a mean of equal numbers may be another in its last bit.
+    return predict_changing(ensemble, *(for_all(ensemble, x) for x in (states, actions)))
 
 
 def for_all(ensemble: Predictor, x: Float[Array, "N *rest"]) -> Float[Array, "K N *rest"]:

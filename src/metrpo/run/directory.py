@@ -29,6 +29,7 @@ import numpy as np
 from metrpo import config as configs
 from metrpo.config import Config
 from metrpo.errors import ConfigError, RunDirectoryError
+from metrpo.history import History
 from metrpo.run import yardstick_record
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.curve import draw_curve
@@ -122,7 +123,7 @@ class RunDirectory:
         """
         found = self._checkpoints()
         layers = template.policy.layers
-        self.episodes.widths = (layers[0][0].shape[0], layers[-1][0].shape[1])
+        self.episodes.layout = History.of_state(self.config.history, layers[0][0].shape[0], layers[-1][0].shape[1])
         if not found:
             self._require_fresh()
             self._write_config()

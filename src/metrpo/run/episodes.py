@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from metrpo.errors import RunDirectoryError, TaskError
+from metrpo.history import History
 from metrpo.run.files import atomic_write, length_of, read_arrays, read_meta, sync_directory, write_arrays, writing
 from metrpo.run.policy_file import load_policy
 from metrpo.safe_load import brief, json_of, text_of
@@ -34,14 +35,17 @@ _KINDS: dict[str, tuple[Any, ...]] = {"terminated": (bool,), "states": (np.float
 
 
 class EpisodeLog:
-    """The episodes of one run directory (see above)."""
+    """The episodes of one run directory (see above).
+
+    It takes and gives states, with the run's history; its files, which other programs write too, hold observations.
+    """
 
     def __init__(self, run_dir: Path, writer: str | None = None) -> None:
         # The name of the only writer there is may come again, over what a kill has left; others are never the same.
         self.folder, self._writer = run_dir / "episodes", writer or f"{os.getpid()}-{secrets.token_hex(4)}"
         self._failed = self.folder / "failed.json"
-        self.widths: tuple[int, int] | None = None
-        """How many numbers a state and an action of this run have, where that is known."""
+        self.layout: History | None = None
+        """How the run's states are put together, where that is known; files hold the plain observations."""
         self.start(after=0)
 
     def start(self, after: int) -> None:
@@ -104,7 +108,8 @@ class EpisodeLog:
         Raises `RunDirectoryError` when it cannot be written.
         """
         number = max([self.taken, *(n + 1 for n in self._numbers())])
-        arrays = {**episode._asdict(), "terminated": np.bool_(episode.terminated)}
+        states = episode.states if self.layout is None else self.layout.newest(episode.states)
+        arrays = {**episode._asdict(), "states": states, "terminated": np.bool_(episode.terminated)}
         arrays = {name: np.asarray(array) for name, array in arrays.items()}
         mine = self.folder / f"from-{self._writer}.npz"
         try:
@@ -157,7 +162,9 @@ class EpisodeLog:
         if set(arrays) != set(Episode._fields):
             raise ValueError(f"expected {', '.join(Episode._fields)}, got {brief(list(arrays))}")
         steps = arrays["rewards"].size
-        states, actions = self.widths or (array.shape[-1] if array.ndim else 0 for array in list(arrays.values())[:2])
+        layout = self.layout
+        widths = (array.shape[-1] if array.ndim else 0 for array in list(arrays.values())[:2])
+        states, actions = widths if layout is None else (layout.observation_size, layout.action_size)
         shapes = {"states": (steps + 1, states), "actions": (steps, actions), "rewards": (steps,), "terminated": ()}
         for name, array in arrays.items():
             if array.shape != shapes[name] or steps == 0:
@@ -166,6 +173,8 @@ class EpisodeLog:
             if array.dtype not in kinds or not _finite(array):
                 expected = np.dtype(kinds[0]).name
                 raise ValueError(f"{name}: expected finite numbers of {expected}, got {array.dtype} or others")
+        if layout is not None and layout.length > 1:
+            arrays["states"] = layout.along(arrays["states"], arrays["actions"])
         return Episode(arrays["states"], arrays["actions"], arrays["rewards"], bool(arrays["terminated"]))
 
 
@@ -204,9 +213,9 @@ def append_episode(
 ) -> Path:
     """Hands a run one real episode of L steps, to learn from in its next iteration; needs NumPy only.
 
-    `states` [L + 1, S] with the one after the last step, `actions` [L, A] in [-1, 1] as executed, `rewards` [L];
-    `terminated`: the task ended the episode, not the clock. May be called while another program improves the policy.
-    Returns the file, which is whole when this returns.
+    `states` [L + 1, O], what was observed, with the one after the last step (also where the policy has a history),
+    `actions` [L, A] in [-1, 1] as executed, `rewards` [L]; `terminated`: the task ended the episode, not the
+    clock. May be called while another program improves the policy. Returns the file, which is whole when this returns.
 
     Raises `TaskError` when the arrays do not fit each other or the run's policy, or are not finite;
     `RunDirectoryError` when `run_dir` holds no run or cannot be written.

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from metrpo.errors import MetrpoError, RunDirectoryError
+from metrpo.history import History
 from metrpo.limits import Limits
 from metrpo.run.files import atomic_write, metrpo_version
 from metrpo.run.policy_file import FILE, LoadedPolicy, load_policy, with_interface
@@ -36,8 +37,9 @@ _OPSET = 13
 def export(run_dir: Path, out: Path | None = None) -> Path:
     """Writes a run's policy to `out` (.py, .onnx or .npz; default: `policy.py` in the run directory) and returns it.
 
-    All three map observations [B, S] to actions [B, A] in [-1, 1], as `load_policy` does; the .py also [S] to [A], and
-    its `control` to the environment's own range. They say how observations are laid out, and that range.
+    All three map observations [B, O] to actions [B, A] in [-1, 1], as `load_policy` does; the .py also [O] to [A], and
+    its `control` to the environment's own range. They say how observations are laid out, and that range. A history the
+    .py and the .npz keep by themselves; an .onnx, which cannot, takes whole states [B, S] and says their layout.
 
     Raises `MetrpoError` for another ending, a name that Python cannot import, a .py file in the way that is not ours,
     or when the onnx package is missing, `RunDirectoryError` when there is no policy, it is damaged, or `out` cannot be
@@ -100,17 +102,23 @@ def _info(policy: LoadedPolicy, source: Path) -> dict[str, Any]:
 def _python(policy: LoadedPolicy, source: Path) -> str:
     sizes = [*(len(weights) for weights, _ in policy.layers), len(policy.layers[-1][1])]
     weights = b"".join(array.astype("<f4").tobytes() for layer in policy.layers for array in layer)
-    example = np.random.default_rng(0).standard_normal(sizes[0]).round(3)
-    info = _info(policy, source)
-    origin = policy.origin
-    example = example if origin is None else example + origin
+    info, origin, layout = _info(policy, source), policy.origin, policy.info.layout
+    examples = np.random.default_rng(0).standard_normal((layout.length, layout.observation_size)).round(3)
+    examples = examples if origin is None else examples + layout.newest(origin)
+    policy.reset()
+    expected = [policy(example) for example in examples]
+    policy.reset()
     fields = {
         "dtype": "float32" if origin is None else "float64",
         "relative": "" if origin is None else _RELATIVE,
         "origin": "" if origin is None else f"_ORIGIN = np.array({origin.tolist()})\n",
         **{name: _inside_docstring(info[name]) for name in ("task", "metrpo", "iteration", "real_steps")},
         "policy_sha256": info["policy_sha256"],
-        "observation_size": sizes[0],
+        "observation_size": layout.observation_size,
+        "history": "" if layout.length == 1 else _history(layout),
+        "remember": "" if layout.length == 1 else _REMEMBER,
+        "begin": "" if layout.length == 1 else _BEGIN,
+        "carried": "" if layout.length == 1 else f"_CARRIED = {list(layout.carried)}\n",
         "action_size": sizes[-1],
         "sizes": sizes,
         "task_literal": ascii(info["task"]),
@@ -120,8 +128,8 @@ def _python(policy: LoadedPolicy, source: Path) -> str:
         "limits": _limits(info),
         "sha256": hashlib.sha256(weights).hexdigest(),
         "weights": "\n".join(textwrap.wrap(base64.b64encode(weights).decode(), 100)),
-        "example": _numbers(example, 17),
-        "action": _numbers(policy(example)),
+        "examples": _rows(examples, 17),
+        "actions": _rows(expected),
     }
     return Template(_SOURCE).substitute(fields)
 
@@ -164,6 +172,20 @@ def _inside_docstring(value: Any) -> str:
     return ascii(str(value))[1:-1].replace('"', '\\"')
 
 
+def _history(layout: History) -> str:
+    """What a state holds, for a docstring."""
+    return f"""\
+
+It sees the last {layout.length} observations and the {layout.length - 1} actions between them, which it remembers:
+call it once a step, and reset() before each episode. Where another action than its own is executed, call
+limited(action) with that.
+"""
+
+
+def _rows(rows: Any, digits: int = 9) -> str:
+    return "[\n" + "".join(f"    {_numbers(row, digits)},\n" for row in rows) + "]"
+
+
 def _numbers(array: np.ndarray, digits: int = 9) -> str:
     return textwrap.fill(str([float(f"{x:.{digits}g}") for x in array.tolist()]), 100, break_on_hyphens=False)
 
@@ -175,11 +197,12 @@ def _onnx(policy: LoadedPolicy, source: Path) -> bytes:
         raise MetrpoError("no package onnx: pip install 'metrpo[export]', or choose a .py or .npz") from error
     limits = Limits.of(policy.info)
     constants = {"low": np.asarray(-limits.max_action), "high": np.asarray(limits.max_action)}
-    nodes, value, kind = [], "observation", TensorProto.FLOAT
+    entry = "observation" if policy.info.history == 1 else "state"
+    nodes, value, kind = [], entry, TensorProto.FLOAT
     if policy.origin is not None:
         kind, value = TensorProto.DOUBLE, "relative"
         nodes += [
-            helper.make_node("Sub", ["observation", "origin"], ["exact"]),
+            helper.make_node("Sub", [entry, "origin"], ["exact"]),
             helper.make_node("Cast", ["exact"], [value], to=TensorProto.FLOAT),
         ]
     for i, (weights, bias) in enumerate(policy.layers):
@@ -201,7 +224,11 @@ def _onnx(policy: LoadedPolicy, source: Path) -> bytes:
         return helper.make_tensor_value_info(name, kind, ["batch", size], doc_string=text)
 
     parts = "Its parts in order: the metadata's observation."
-    observation = end("observation", kind, len(policy.layers[0][0]), parts)
+    if entry == "state":
+        held = ", ".join(f"{text} ({size})" for size, text in policy.info.layout.parts)
+        first = "At an episode's start older observations repeat the first, and actions are 0."
+        parts = f"In order: {held}. Of an observation: the metadata's observation. {first}"
+    observation = end(entry, kind, len(policy.layers[0][0]), parts)
     units = "In [-1, 1], without noise; the environment's range: the metadata's action_low and action_high."
     action = end("action", TensorProto.FLOAT, len(policy.layers[-1][1]), units)
     tensors = [numpy_helper.from_array(array.astype(np.float32), name) for name, array in constants.items()]
@@ -213,9 +240,9 @@ def _onnx(policy: LoadedPolicy, source: Path) -> bytes:
         inputs.append(end("previous_action", TensorProto.FLOAT, len(policy.layers[-1][1]), text))
     graph = helper.make_graph(nodes, "policy", inputs, [action], tensors, doc_string="A tanh network, clipped.")
     info = {name: _utf8(value) for name, value in _info(policy, source).items()}
-    text = f"A policy for {info['task']}: observation [batch, S] to action [batch, A], float32."
+    text = f"A policy for {info['task']}: {entry} [batch, S] to action [batch, A], float32."
     if policy.origin is not None:
-        text += " The observation is float64: float32 could not hold it."
+        text += f" The {entry} is float64: float32 could not hold it."
     origin = {"producer_name": "metrpo", "producer_version": info["metrpo"], "doc_string": text}
     model = helper.make_model_gen_version(graph, opset_imports=[helper.make_opsetid("", _OPSET)], **origin)
     helper.set_model_props(model, info)
@@ -235,6 +262,21 @@ _RELATIVE = """\
         hidden = (hidden - _ORIGIN).astype(np.float32)
 """
 """In the exported file, where observations have an origin."""
+_BEGIN = """\
+    if "state" not in _last:
+        none = np.zeros((*hidden.shape[:-1], (HISTORY - 1) * ACTION_SIZE), hidden.dtype)
+        hidden = np.concatenate([hidden] * HISTORY + [none], axis=-1)
+    else:
+        if _last["state"].shape[:-1] != hidden.shape[:-1] or _last["action"].shape[:-1] != hidden.shape[:-1]:
+            raise ValueError("observation: expected as many as in the step before: call reset() first")
+        before = np.concatenate([_last["state"], _last["action"].astype(hidden.dtype)], axis=-1)
+        hidden = np.concatenate([hidden, before[..., _CARRIED]], axis=-1)
+    state = hidden
+"""
+_REMEMBER = """\
+    _last["state"] = state
+"""
+"""In the exported file, where its policy has a history: the state that is seen, and what of it is kept."""
 
 _SOURCE = '''\
 """A trained control policy in one file: observations in, actions out. It needs NumPy and nothing else.
@@ -249,7 +291,7 @@ $layout
 Its own range of actions, for which -1 and 1 stand:
 $range
 Its limits: $limits
-
+$history
 Written by metrpo $metrpo from a policy.npz with SHA-256
 $policy_sha256,
 trained for $iteration iterations on $real_steps real steps. Run this file to check it.
@@ -269,37 +311,40 @@ ACTION_LOW = INFO["action_low"]
 ACTION_HIGH = INFO["action_high"]
 MAX_ACTION = INFO["max_action"]
 MAX_CHANGE = INFO["max_change"]
+HISTORY = INFO["history"]
 _last = {}
 
 
 def reset():
-    """Begins an episode: MAX_CHANGE counts from 0, the middle of the range of actions."""
+    """Begins an episode: MAX_CHANGE counts from 0, the middle of the range of actions; no history is left."""
     _last.clear()
 
 
 def act(observation):
     """The action, in [-1, 1], float32: [S] -> [A] or [B, S] -> [B, A]; ValueError for other shapes, NaN or infinity.
 
-    Within the limits: call it once a step, and reset() before each episode, where there is a MAX_CHANGE.
+    Within the limits: call it once a step, and reset() before each episode, where there is a MAX_CHANGE or a HISTORY.
     """
     with np.errstate(over="ignore"):
         hidden = np.asarray(observation, dtype=np.$dtype)
     if hidden.ndim not in (1, 2) or hidden.shape[-1] != OBSERVATION_SIZE:
         size = OBSERVATION_SIZE
         raise ValueError(f"observation: expected shape [{size}] or [B, {size}], got {list(hidden.shape)}")
-$relative    if not np.isfinite(hidden).all():
+$begin$relative    if not np.isfinite(hidden).all():
         at = np.argwhere(~np.isfinite(hidden))[0]
         raise ValueError(f"observation: expected finite numbers, got {hidden[tuple(at)]} at {at.tolist()}")
     for weights, bias in _LAYERS[:-1]:
         hidden = np.tanh(hidden @ weights + bias)
     weights, bias = _LAYERS[-1]
-    return limited(np.clip(hidden @ weights + bias, -1.0, 1.0))
+$remember    return limited(np.clip(hidden @ weights + bias, -1.0, 1.0))
 
 
 def limited(action):
     """An action, such as one of your own, within MAX_ACTION and MAX_CHANGE; it is the last one from then on."""
     action = np.clip(np.asarray(action, dtype=np.float32), -MAX_ACTION, MAX_ACTION)
     if MAX_CHANGE is None:
+        if HISTORY > 1:
+            _last["action"] = action
         return action
     before = _last.get("action", np.zeros_like(action))
     if before.shape != action.shape:
@@ -343,17 +388,19 @@ def _layers(text):
     return layers
 
 
-${origin}_SIZES = $sizes
+${origin}${carried}_SIZES = $sizes
 _SHA256 = "$sha256"
 _LAYERS = _layers("""
 $weights
 """)
-_EXAMPLE = $example
-_EXAMPLE_ACTION = $action
+_EXAMPLES = $examples
+_EXAMPLE_ACTIONS = $actions
 
 if __name__ == "__main__":
-    _found = act(_EXAMPLE)
-    if not np.allclose(_found, _EXAMPLE_ACTION, rtol=0, atol=1e-4):
-        raise SystemExit(f"{TASK!a}: expected the action {_EXAMPLE_ACTION}, got {_found.tolist()}")
+    for _attempt in ("", " after a reset()"):
+        reset()
+        _found = np.array([act(_observation) for _observation in _EXAMPLES])
+        if not np.allclose(_found, _EXAMPLE_ACTIONS, rtol=0, atol=1e-4):
+            raise SystemExit(f"{TASK!a}: expected the actions {_EXAMPLE_ACTIONS}, got {_found.tolist()}{_attempt}")
     print(f"ok: {TASK!a}, observations of {OBSERVATION_SIZE} numbers, actions of {ACTION_SIZE}")
 '''

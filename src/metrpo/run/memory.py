@@ -42,12 +42,12 @@ def require_memory(config: Config, task: Task) -> None:
 
 def _needs(config: Config, task: Task) -> list[Need]:
     s, a, e = task.state_size, task.action_size, config.ensemble
-    network = _weights((s + a, *e.hidden, s + len(task.learned))) * _FLOAT * _COPIES
+    network = _weights((s + a, *e.hidden, task.predicted)) * _FLOAT * _COPIES
     policy = _weights((s, *config.policy.hidden, a)) * _FLOAT * _COPIES
     value = _weights((s, *config.advantage.value_hidden, 1)) * _FLOAT * _COPIES
     needs = [Need("policy.hidden", config.policy.hidden, "the policy's weights", policy)]
     if config.method == "model-based":
-        batch = e.members * config.fit.batch_size * (2 * s + a) * _FLOAT
+        batch = e.members * config.fit.batch_size * (s + a + task.observation_size) * _FLOAT
         imagined = config.imagine.steps * (2 * s + a) * _FLOAT
         starts = e.members * config.validate.starts * s * _FLOAT
         needs += [

@@ -14,6 +14,7 @@ import numpy as np
 
 from metrpo.config import Config
 from metrpo.errors import RunDirectoryError
+from metrpo.history import History
 from metrpo.limits import Limits
 from metrpo.run.files import FORMAT, atomic_write, inside, metrpo_version, read_arrays, write_arrays
 from metrpo.safe_load import brief
@@ -29,7 +30,7 @@ class PolicyInfo:
     task: str
     """Name of the task it was trained on."""
     observation_size: int
-    """S"""
+    """O, of what it is called with."""
     action_size: int
     """A"""
     hidden: tuple[int, ...]
@@ -56,6 +57,13 @@ class PolicyInfo:
     """Its actions stay within plus and minus this."""
     max_change: float | None = None
     """Most that its actions change from one step to the next; None: any."""
+    history: int = 1
+    """Observations that its network sees: the newest, the older ones, and the actions between them."""
+
+    @property
+    def layout(self) -> History:
+        """How the states that its network sees are put together."""
+        return History(self.history, self.observation_size, self.action_size)
 
 
 _MOST = 1e300
@@ -66,7 +74,7 @@ _MADE = ("env_kwargs", "imports")
 """Fields that say how the environment is made."""
 _LIMITS = ("max_action", "max_change")
 """Fields that say what its actions are held to."""
-_SINCE = dict.fromkeys(_SHOWN) | {"env_kwargs": [], "imports": [], "max_action": 1.0, "max_change": None}
+_SINCE = dict.fromkeys(_SHOWN) | {"env_kwargs": [], "imports": [], "max_action": 1.0, "max_change": None, "history": 1}
 """Fields that older policies lack, and what that means."""
 
 
@@ -102,32 +110,35 @@ class Weights(Protocol):
 class LoadedPolicy:
     """A deterministic policy: call it with observations, get actions.
 
-    Where it has a `max_change`, it remembers its last action: call it once a step, and `reset()` before each episode.
+    Where it has a `max_change`, it remembers its last action, and with a `history` its last observations and the
+    actions between them: call it once a step, and `reset()` before each episode.
     """
 
     info: PolicyInfo
     layers: tuple[tuple[np.ndarray, np.ndarray], ...]
     """Weights [in, out] and bias [out] of every layer."""
     origin: np.ndarray | None = None
-    """[S], float64: what its observations are counted from, where that is not 0."""
+    """[S], float64: what its states are counted from, where that is not 0."""
     _last: dict[str, np.ndarray] = field(default_factory=dict, compare=False, repr=False)
-    """The last action, where the next one must not lie far from it."""
+    """The last `action`, where the next one depends on it; the last `state`, where that holds a history; and the action
+    `taken` in it, once there is one."""
 
     def __call__(self, observation: Any) -> np.ndarray:
-        """The action, within the policy's limits in [-1, 1], float32: [S] -> [A] or [B, S] -> [B, A].
+        """The action, within the policy's limits in [-1, 1], float32: [O] -> [A] or [B, O] -> [B, A].
 
         Raises `ValueError` as `unlimited` and `limited`.
         """
         return self.limited(self.unlimited(observation))
 
     def reset(self) -> None:
-        """Begins an episode: `max_change` counts from 0, the middle of the range of actions."""
+        """Begins an episode: `max_change` counts from 0, the middle of the range of actions; no history is left."""
         self._last.clear()
 
     def limited(self, action: Any) -> np.ndarray:
         """An action [A] or [B, A], such as `unlimited` gives and with noise of one's own, within the policy's limits.
 
-        Remembers it as the last one. Raises `ValueError` when the one before was for other robots: of another shape.
+        Remembers it as the last one, also for a history. Raises `ValueError` when the one before was for other robots:
+        of another shape.
         """
         given, before = np.asarray(action, np.float32), self._last.get("action")
         if before is not None and before.shape != given.shape:
@@ -136,18 +147,51 @@ class LoadedPolicy:
         found = Limits.of(self.info).within(given, before).astype(np.float32)
         if self.info.max_change is not None:
             self._last["action"] = found
+        if self.info.history > 1:
+            self._last["taken"] = found
         return found
 
     def unlimited(self, observation: Any) -> np.ndarray:
-        """The action in [-1, 1] before the policy's limits, float32: [S] -> [A] or [B, S] -> [B, A]; keeps nothing.
+        """The action in [-1, 1] before the policy's limits, float32: [O] -> [A] or [B, O] -> [B, A].
 
-        Raises `ValueError` when the observation has another shape, or is not finite in float32.
+        Keeps nothing; with a history, the observation: then call `limited` with the action that is executed, before the
+        next observation. Raises `ValueError` when the observation has another shape, or is not finite in float32, and
+        where a history lacks the action that led to it.
         """
-        with np.errstate(over="ignore"):
-            hidden = np.asarray(observation, dtype=np.float32 if self.origin is None else np.float64)
-        size = self.info.observation_size
-        if hidden.ndim not in (1, 2) or hidden.shape[-1] != size:
-            raise ValueError(f"observation: expected shape [{size}] or [B, {size}], got {list(hidden.shape)}")
+        if self.info.history == 1:
+            return self.of_state(observation)
+        state = self._state(observation)
+        action = self.of_state(state)
+        self._last.pop("taken", None)
+        self._last["state"] = state
+        return action
+
+    def _state(self, observation: Any) -> np.ndarray:
+        """The state [S] or [B, S] that an observation makes with what came before."""
+        layout = self.info.layout
+        observed = _as_batch(observation, layout.observation_size, np.float32 if self.origin is None else np.float64)
+        before, action = self._last.get("state"), self._last.get("taken")
+        if before is None:
+            return layout.begin(observed)
+        if before.shape[:-1] != observed.shape[:-1]:
+            expected, got = [*before.shape[:-1], layout.observation_size], list(observed.shape)
+            raise ValueError(f"observation: expected shape {expected} as in the step before, got {got}; reset() first")
+        wanted = (*observed.shape[:-1], layout.action_size)
+        if action is None or action.shape != wanted:
+            came = "none" if action is None else f"one of {list(action.shape)}"
+            raise ValueError(
+                f"observation: expected an action of shape {list(wanted)} since the one before, got {came}: call "
+                "limited(action) with what is executed, or reset() to begin an episode"
+            )
+        return layout.follow(before, action, observed)
+
+    def of_state(self, state: Any) -> np.ndarray:
+        """The action in [-1, 1] before the policy's limits, of a whole state (`metrpo.history`): [S] -> [A] or
+        [B, S] -> [B, A]; keeps nothing. Without a history a state is an observation.
+
+        Raises `ValueError` when the state has another shape, or is not finite in float32.
+        """
+        hidden = _as_batch(state, self.info.layout.state_size, np.float32 if self.origin is None else np.float64)
         if self.origin is not None:
             with np.errstate(over="ignore"):
                 hidden = (hidden - self.origin).astype(np.float32)
@@ -176,6 +220,15 @@ class LoadedPolicy:
         return scaled.astype(np.float32 if exact else np.float64)
 
 
+def _as_batch(observation: Any, size: int, kind: type) -> np.ndarray:
+    """Raises `ValueError` unless it is of shape [size] or [B, size]."""
+    with np.errstate(over="ignore"):
+        found: np.ndarray = np.asarray(observation, dtype=kind)
+    if found.ndim not in (1, 2) or found.shape[-1] != size:
+        raise ValueError(f"observation: expected shape [{size}] or [B, {size}], got {list(found.shape)}")
+    return found
+
+
 def save_policy(
     directory: Path,
     policy: Weights,
@@ -189,13 +242,16 @@ def save_policy(
 ) -> None:
     """Writes `policy.npz` (weights and info) and `policy.json` (the info for people and other programs).
 
-    `origin` [S], float64, is what its observations are counted from; `settings` are the run's.
+    `origin` [S], float64, is what its states are counted from; `settings` are the run's.
 
     Raises `RunDirectoryError` when they cannot be written.
     """
     layers = [(np.asarray(w), np.asarray(b)) for w, b in policy.layers]
     hidden = tuple(len(b) for _, b in layers[:-1])
-    info = PolicyInfo(task, layers[0][0].shape[0], layers[-1][0].shape[1], hidden, iteration, real_steps, return_real)
+    history = 1 if settings is None else settings.history
+    layout = History.of_state(history, layers[0][0].shape[0], layers[-1][0].shape[1])
+    sizes = (layout.observation_size, layout.action_size, hidden)
+    info = PolicyInfo(task, *sizes, iteration, real_steps, return_real, history=history)
     info = with_interface(info, interface)
     if settings is not None:
         info = replace(info, **{name: getattr(settings, name) for name in (*_MADE, *_LIMITS)})
@@ -268,6 +324,7 @@ def _info(stored: Any, path: Path) -> PolicyInfo:
         *((n, _are_texts(stored[n]), "a list of texts") for n in _MADE),
         ("max_action", _is_share(stored["max_action"]), "a number above 0 and at most 1"),
         ("max_change", stored["max_change"] is None or _is_positive(stored["max_change"]), "a number above 0"),
+        ("history", _is_size(stored["history"]), "a whole number above 0"),
         # These say where it comes from and mean nothing to its use.
         *(
             (n, isinstance(stored[n], int | float | str | None), "a number")
@@ -316,12 +373,12 @@ def _is_size(value: Any) -> bool:
 def _layers(
     info: PolicyInfo, arrays: Mapping[str, np.ndarray], path: Path
 ) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
-    sizes = (info.observation_size, *info.hidden, info.action_size)
+    sizes = (info.layout.state_size, *info.hidden, info.action_size)
     expected: dict[str, tuple[int, ...]] = {"log_std": (info.action_size,)}
     for i, (inputs, outputs) in enumerate(pairwise(sizes)):
         expected |= {f"w{i}": (inputs, outputs), f"b{i}": (outputs,)}
     if "origin" in arrays:
-        expected["origin"] = (info.observation_size,)
+        expected["origin"] = (info.layout.state_size,)
     wrong = [f"{name} is missing" for name in expected if name not in arrays]
     wrong += [f"got {brief(name)} besides" for name in arrays if name not in expected]
     wrong += [

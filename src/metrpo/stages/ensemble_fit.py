@@ -11,7 +11,7 @@ from metrpo.config import Config
 from metrpo.console.progress import Progress
 from metrpo.errors import DivergedError
 from metrpo.model import ensemble as ensembles
-from metrpo.model.ensemble import Ensemble, Networks
+from metrpo.model.ensemble import Carried, Ensemble, Networks
 from metrpo.model.fit import FitInfo, fit, refit
 from metrpo.seeds import Stage, key_of
 from metrpo.types import Array
@@ -56,7 +56,7 @@ def fit_ensemble(
             f"start anew with a lower fit.learning_rate than {config.fit.learning_rate}, or look for outliers in the "
             f"data (its largest change of a state is {largest:.3g})"
         )
-    return ensemble, info
+    return ensemble._replace(carried=Carried(task.carried)), info
 
 
 def _named(members: np.ndarray) -> str:
@@ -66,4 +66,4 @@ def _named(members: np.ndarray) -> str:
 def fresh_networks(config: Config, task: Task, key: Array) -> Networks:
     """Networks that have seen nothing."""
     e = config.ensemble
-    return ensembles.init(key, e.members, task.state_size, task.action_size, e.hidden, len(task.learned))
+    return ensembles.init(key, e.members, task.state_size, task.action_size, e.hidden, task.predicted)

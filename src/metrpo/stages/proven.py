@@ -90,7 +90,7 @@ def settle(config: Config, task: Task, before: State, candidate: State, proofs: 
     rng = rng_of(config.seed, candidate.iteration, Stage.PROVE, config.validate.real_episodes)
     state = candidate._replace(
         real_steps=candidate.real_steps + sum(len(e.rewards) for e in proofs),
-        dataset=datasets.add(candidate.dataset, proofs, config.collect, rng, task.learned),
+        dataset=datasets.add(candidate.dataset, proofs, config.collect, rng, task.learned, task.carried),
         proven=verdict.best,
     )
     if verdict.given_up:

@@ -101,7 +101,7 @@ def _diagnosis(config: Config, task: Task, state: State, ensemble: Ensemble) -> 
     dataset, horizon = state.dataset, imagined_horizon(config, task)
     key = key_of(config.seed, state.iteration, Stage.DIAGNOSE)
     record = partial(diagnose, ensemble, state.policy, dataset.validation, dataset.train, horizon, key)
-    return recorded("diagnostics", state.iteration, record, unknown(task.state_size, horizon))
+    return recorded("diagnostics", state.iteration, record, unknown(task.observation_size, horizon))
 
 
 def _end_calibration(task: Task, dataset: Dataset, ensemble: Ensemble, iteration: int) -> Row:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from metrpo.config import CollectConfig
+from metrpo.history import tied
 from metrpo.types import Episode, Transitions
 from metrpo.world.origin import origin_of, relative
 
@@ -25,12 +26,12 @@ class Dataset(NamedTuple):
     """[S], float64: what states are counted from (`world.origin`); the first data decide it."""
 
 
-def empty(state_size: int, action_size: int, learned: int = 0) -> Dataset:
-    """A dataset without transitions; `learned` columns more than the state are to be predicted."""
+def empty(state_size: int, action_size: int, predicted: int | None = None) -> Dataset:
+    """A dataset without transitions, of which so many columns are to be `predicted`; by default those of the state."""
 
     def none() -> Transitions:
         states, actions, deltas = (
-            np.zeros((0, n), np.float32) for n in (state_size, action_size, state_size + learned)
+            np.zeros((0, n), np.float32) for n in (state_size, action_size, predicted or state_size)
         )
         return Transitions(states, actions, deltas, 0)
 
@@ -43,16 +44,20 @@ def add(
     config: CollectConfig,
     rng: np.random.Generator,
     learned: tuple[str, ...] = (),
+    carried: tuple[int, ...] = (),
 ) -> Dataset:
     """The dataset with `episodes` added, a share of them (whole ones) to the validation set.
 
-    `learned` names what is to be predicted besides the state (`Task.learned`).
+    `learned` names what is to be predicted besides the state (`Task.learned`); the part of the state that is `carried`
+    over (`Task.carried`) is not.
 
     Both sets get at least one episode where there are two, so that a first, short collection can be validated.
     """
     origin = dataset.origin
     if episodes and not len(dataset.starts):
-        origin = origin_of(np.concatenate([e.states for e in episodes]))
+        seen = np.concatenate([e.states for e in episodes])
+        # What is copied from state to state must not change by where it is counted from.
+        origin = tied(origin_of(seen[:, : seen.shape[1] - len(carried)]), carried)
     order = rng.permutation(len(episodes))
     held_out = min(max(1, round(config.validation_fraction * len(episodes))), len(episodes) - 1)
     validation = [episodes[i] for i in order[:held_out]]
@@ -60,8 +65,8 @@ def add(
     # A single first episode serves for both: there is nothing else to validate on.
     validation = validation or ([] if dataset.validation.size else train)
     return Dataset(
-        append(dataset.train, train, config.max_train, learned, origin),
-        append(dataset.validation, validation, config.max_validation, learned, origin),
+        append(dataset.train, train, config.max_train, learned, origin, carried),
+        append(dataset.validation, validation, config.max_validation, learned, origin, carried),
         np.concatenate([dataset.starts, *(_counted_from(origin, e)[:1].astype(np.float32) for e in episodes)]),
         origin,
     )
@@ -98,12 +103,17 @@ def append(
     most: int,
     learned: tuple[str, ...] = (),
     origin: np.ndarray | None = None,
+    carried: tuple[int, ...] = (),
 ) -> Transitions:
-    """The transitions with those of `episodes` added, counted from `origin`; of more than `most` the oldest go."""
+    """The transitions with those of `episodes` added, counted from `origin`; of more than `most` the oldest go.
+
+    `learned` and `carried` as in `add`.
+    """
     exact = [e.states.astype(np.float32) if origin is None else _counted_from(origin, e) for e in episodes]
     states = np.concatenate([old.states, *(x[:-1].astype(np.float32) for x in exact)])[-most:]
     actions = np.concatenate([old.actions, *(e.actions for e in episodes)])[-most:]
-    changes = [_deltas(x, e, learned) for x, e in zip(exact, episodes, strict=True)]
+    changed = states.shape[1] - len(carried)
+    changes = [_deltas(x[:, :changed], e, learned) for x, e in zip(exact, episodes, strict=True)]
     deltas = np.concatenate([old.deltas, *changes])[-most:]
     return Transitions(states, actions, deltas, len(states))
 

@@ -36,6 +36,7 @@ def check_formulas(task: Task, rng: np.random.Generator) -> None:
 
 
 def _check_rewards(task: Task, episodes: list[Episode]) -> None:
+    newest = task.layout.newest
     paid = np.concatenate([e.rewards for e in episodes]).astype(np.float64)
     states, actions, following = _transitions(episodes)
     assert task.reward is not None
@@ -52,8 +53,8 @@ def _check_rewards(task: Task, episodes: list[Episode]) -> None:
         raise TaskError(
             f"{task.name}: the reward's formula is not the environment's: of {len(paid)} random transitions the "
             f"largest difference is {off[at]:.4g} at number {at}, where the environment paid {paid[at]:.6g} and the "
-            f"formula says {said[at]:.6g}; s = {_row(states[at])}, a = {_row(actions[at])} (in [-1, 1]), "
-            f"s' = {_row(following[at])}. {_ADVICE}"
+            f"formula says {said[at]:.6g}; s = {_row(newest(states[at]))}, a = {_row(actions[at])} (in [-1, 1]), "
+            f"s' = {_row(newest(following[at]))}. {_ADVICE}"
         )
 
 
@@ -67,7 +68,7 @@ def _check_ends(task: Task, episodes: list[Episode]) -> None:
         raise TaskError(
             f"{task.name}: the formula of termination is not the environment's: at random transition {at} of "
             f"{len(ended)} the environment {'ended' if ended[at] else 'did not end'} the episode, the formula says "
-            f"otherwise; s' = {_row(following[at])}. {_ADVICE}"
+            f"otherwise; s' = {_row(task.layout.newest(following[at]))}. {_ADVICE}"
         )
 
 

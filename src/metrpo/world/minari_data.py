@@ -17,7 +17,7 @@ PREFIX = "minari:"
 
 
 def load(name: str, task: Task) -> list[Episode]:
-    """The episodes of the dataset `minari:NAME`, downloaded where it is not on this machine.
+    """The episodes, of observations, of the dataset `minari:NAME`, downloaded where it is not on this machine.
 
     Observations are flattened, actions rescaled from the dataset's bounds to [-1, 1]. Raises `TaskError` when Minari is
     missing, there is no such dataset, or it does not fit the task.
@@ -41,7 +41,7 @@ def load(name: str, task: Task) -> list[Episode]:
     if not episodes:
         raise TaskError(f"{name}: expected transitions, got none")
     for what, expected, rows in (
-        ("observations", task.state_size, episodes[0].states),
+        ("observations", task.observation_size, episodes[0].states),
         ("actions", task.action_size, episodes[0].actions),
     ):
         if rows.shape[1] != expected:

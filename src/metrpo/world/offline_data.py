@@ -22,12 +22,18 @@ def load(path: str | Path, task: Task) -> list[Episode]:
     Its arrays: `states` and `next_states` [n, S], `actions` [n, A] in [-1, 1], `rewards` [n], and `terminated` [n] (1
     where the task, not the clock, ended the episode).
 
-    An episode goes on where the next transition starts in the state in which this one ended. Files with pickled objects
+    An episode goes on where the next transition starts in the state in which this one ended. For a task with a history
+    the arrays hold observations all the same, [n, O], and the episodes its states. Files with pickled objects
     and archives that do not hold what they claim are refused (see `metrpo.safe_load`). Raises `TaskError` when the file
     cannot be read, lacks an array, or one does not fit the task.
     """
-    if str(path).startswith(minari_data.PREFIX):
-        return minari_data.load(str(path), task)
+    plain = minari_data.load(str(path), task) if str(path).startswith(minari_data.PREFIX) else _read(path, task)
+    if task.history == 1:
+        return plain
+    return [e._replace(states=task.layout.along(e.states, e.actions)) for e in plain]
+
+
+def _read(path: str | Path, task: Task) -> list[Episode]:
     if not Path(path).exists():
         raise TaskError(f"{path}: there is no such file; expected an .npz of {', '.join(ARRAYS)}")
     with opened(Path(path), TaskError) as file:
@@ -35,7 +41,8 @@ def load(path: str | Path, task: Task) -> list[Episode]:
     if missing := [name for name in ARRAYS if name not in found]:
         raise TaskError(f"{path}: expected the arrays {', '.join(ARRAYS)}; it lacks {', '.join(missing)}")
     count = found["rewards"].size
-    widths = {"states": (task.state_size,), "next_states": (task.state_size,), "actions": (task.action_size,)}
+    size = (task.observation_size,)
+    widths = {"states": size, "next_states": size, "actions": (task.action_size,)}
     for name, array in found.items():
         _check(f"{path}: {name}", array, (count, *widths.get(name, ())))
     if count == 0:

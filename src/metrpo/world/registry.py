@@ -14,6 +14,7 @@ from metrpo.config import Config
 from metrpo.config.env_kwargs import canonical
 from metrpo.errors import TaskError
 from metrpo.limits import Limits
+from metrpo.world.history_env import with_history
 from metrpo.world.interface import with_positions
 from metrpo.world.resolve import import_module, require_no_kwargs, resolve, task_of, with_kwargs
 from metrpo.world.task import Task
@@ -64,10 +65,11 @@ def get_task(name: str, env_kwargs: Iterable[str] | Mapping[str, Any] = (), impo
 def task_for(config: Config) -> Task:
     """The config's task, its formulas left out where they are to be learned; asked for once, and then passed on.
 
-    Raises `TaskError` as `get_task`.
+    Raises `TaskError` as `get_task`, `ConfigError` for a history that is too long.
     """
     task = get_task(config.task, config.env_kwargs, config.imports)
-    return limited(without_formulas(task) if config.learn_reward else task, Limits.of(config))
+    task = without_formulas(task) if config.learn_reward else task
+    return with_history(limited(task, Limits.of(config)), config.history)
 
 
 @cache

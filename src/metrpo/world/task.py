@@ -9,6 +9,7 @@ from typing import Any, Literal
 import gymnasium
 
 from metrpo.errors import TaskError
+from metrpo.history import History
 from metrpo.limits import NONE, Limits
 from metrpo.types import Array
 from metrpo.world.env_wrapper import refuse_running_statistics
@@ -25,7 +26,7 @@ class Task:
     env_id: str | None
     """Gymnasium id, "metrpo/Swimmer-v0"; None, and no `make`: only another program can play it (see `metrpo init`)."""
     state_size: int
-    """S"""
+    """S; with a history, of all that a state holds."""
     action_size: int
     """A; actions lie in [-1, 1]."""
     horizon: int
@@ -45,10 +46,32 @@ class Task:
     """What the environment shows and takes, as a policy's file says it; None: unknown."""
     limits: Limits = NONE
     """What actions every policy is held to."""
+    history: int = 1
+    """N, the observations that a state holds, with the N-1 actions between them (`metrpo.history`). The setting makes
+    it (`world.history_env`): a task of one's own leaves it at 1."""
 
     def __post_init__(self) -> None:
         require_size(self.name, self.state_size)
         require_horizon(self.name, self.horizon)
+        try:
+            self.layout  # noqa: B018  # raises where there is none
+        except ValueError as error:
+            raise TaskError(f"{self.name}: history: {error}; leave it at 1 and set --history") from None
+
+    @property
+    def layout(self) -> History:
+        """How states are put together out of observations and actions."""
+        return History.of_state(self.history, self.state_size, self.action_size)
+
+    @property
+    def observation_size(self) -> int:
+        """O, of what the environment shows at a time: the state, unless that holds a history."""
+        return self.layout.observation_size
+
+    @property
+    def carried(self) -> tuple[int, ...]:
+        """[S - O], where what models need not predict of the next state stands in state and action, [S + A]."""
+        return self.layout.carried
 
     @property
     def playable(self) -> bool:
@@ -57,8 +80,13 @@ class Task:
 
     @property
     def learned(self) -> tuple[str, ...]:
-        """What the models predict besides the state, in the order of their outputs: "reward", "end"."""
+        """What the models predict besides the observation, in the order of their outputs: "reward", "end"."""
         return ("reward",) * (self.reward is None) + ("end",) * (self.terminated == "learned")
+
+    @property
+    def predicted(self) -> int:
+        """D, of all that the models predict."""
+        return self.observation_size + len(self.learned)
 
     def make_env(self, **kwargs: Any) -> gymnasium.Env:
         """A fresh environment with the time limit of the task (`kwargs` such as `render_mode="rgb_array"`).
