@@ -25,7 +25,10 @@ class Callback(Protocol):
         """Training begins, or goes on after the iterations in `rows`."""
 
     def on_episode(self, episode: Episode) -> None:
-        """One more real episode has been played, exploring or as a proof (only where the method learns models)."""
+        """One more real episode has been played, exploring or as a proof (only where the method learns models).
+
+        Its states hold the run's history (`config.history`); the newest observation comes first.
+        """
 
     def on_iteration(self, row: Row) -> None:
         """An outer iteration is finished, with this row of `metrics.csv`."""

@@ -16,6 +16,7 @@ from helpers import (
     random_transitions,
     slow_delta,
 )
+from metrpo.history import History
 from metrpo.model import ensemble as ensembles
 from metrpo.types import Transitions
 
@@ -32,6 +33,38 @@ def test_prediction_is_each_members_own_relu_network(hidden):
     np.testing.assert_allclose(delta, expected, atol=1e-5)
     np.testing.assert_allclose(predict(ensemble, states, actions), states + expected, atol=1e-5)
     assert ensemble.members == 3
+
+
+@pytest.mark.parametrize("learned", [0, 1, 2])
+def test_of_a_history_only_the_newest_observation_is_predicted_and_the_rest_is_shifted(learned):
+    layout, rng = History(3, 2, 1), np.random.default_rng(0)
+    size, outputs = layout.state_size, layout.observation_size + learned  # with two more, as many as a state of N = 2
+    networks = random_ensemble(1, 3, size, 1, (8, outputs)).networks[:2]
+    n = random_normaliser(rng, size, 1)
+    n = n._replace(delta_mean=n.delta_mean[:outputs], delta_std=n.delta_std[:outputs])
+    ensemble = ensembles.Ensemble(networks, n, ensembles.Carried(layout.carried))
+    states, actions = rng.normal(size=(3, 5, size)).astype(np.float32), rng.normal(size=(3, 5, 1)).astype(np.float32)
+    found = predict(ensemble, states, actions)
+    assert found.shape == (3, 5, size + learned)
+    for k, b in np.ndindex(3, 5):
+        changes = slow_delta(ensemble, k, states[k, b], actions[k, b])
+        newest = states[k, b, :2] + changes[:2]
+        np.testing.assert_allclose(found[k, b, :2], newest, atol=1e-5)
+        np.testing.assert_allclose(found[k, b, size:], changes[2:], atol=1e-5)
+        (_, o1, o2), a1 = states[k, b, :6].reshape(3, 2), states[k, b, 6]
+        np.testing.assert_array_equal(found[k, b, 2:size], [*states[k, b, :2], *o1, *actions[k, b], a1])
+        assert not np.isin(o2, found[k, b]).any(), "the oldest is forgotten"
+
+
+def test_a_state_may_be_as_long_as_an_observation_and_what_is_learned_besides():
+    """Two observations of one number and an action are three, as are one observation, reward and end."""
+    layout, rng = History(2, 1, 1), np.random.default_rng(0)
+    networks, n = random_ensemble(1, 1, 3, 1, ()).networks, random_normaliser(rng, 3, 1)
+    ensemble = ensembles.Ensemble(networks, n, ensembles.Carried(layout.carried))
+    state, action = np.array([[[1.0, 2.0, 3.0]]], np.float32), np.array([[[0.5]]], np.float32)
+    changes = slow_delta(ensemble, 0, state[0, 0], action[0, 0])
+    expected = [1.0 + changes[0], 1.0, 0.5, changes[1], changes[2]]
+    np.testing.assert_allclose(predict(ensemble, state, action)[0, 0], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("relu", [False, True])
