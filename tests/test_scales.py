@@ -15,7 +15,7 @@ import pytest
 import probe
 from helpers import random_ensemble, random_policy
 from metrpo import algorithm, scales, training
-from metrpo.config import CollectConfig
+from metrpo.config import CollectConfig, Config
 from metrpo.errors import RunDirectoryError
 from metrpo.model import ensemble as ensembles
 from metrpo.model.diagnostics import unknown
@@ -33,6 +33,7 @@ from metrpo.stages import records
 from metrpo.types import Episode
 from metrpo.world import dataset as datasets
 from metrpo.world import registry
+from metrpo.world.history_env import with_history
 from metrpo.world.interface import Interface
 from metrpo.world.origin import origin_of, relative, shifted
 from metrpo.world.resolve import task_of
@@ -84,6 +85,20 @@ def episode(offset=0.0, length=30, seed=0, size=2):
 def dataset_of(episodes, old=None):
     old = old or datasets.empty(episodes[0].states.shape[1], 1)
     return datasets.add(old, episodes, CONFIG, np.random.default_rng(0))
+
+
+def test_of_a_history_the_newest_observation_alone_is_spoken_of():
+    task = with_history(dataclasses.replace(probe.PROBE, name="Coarse"), 3)
+    plain = episode(np.array([0.0, 1e6]), size=2)
+    plain = plain._replace(actions=np.zeros((30, 2), np.float32))
+    whole = plain._replace(states=task.layout.along(plain.states, plain.actions))
+    nothing = datasets.empty(task.state_size, 2, task.predicted)
+    found = datasets.add(nothing, [whole], CONFIG, np.random.default_rng(0), carried=task.carried)
+    loud = found._replace(train=found.train._replace(states=found.train.states + np.float32(2e5)))
+    for episodes in ([whole], []):  # from the episodes themselves, and from the dataset alone
+        said = {f.dimensions for f in scales.findings(Config("Coarse"), task, loud, episodes)}
+        assert (0, 1) in said, "which explode"
+        assert {d for dimensions in said for d in dimensions} == {0, 1}
 
 
 # ---------------------------------------------------------------- the origin

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from helpers import random_episode, random_transitions
 from metrpo.config import CollectConfig
+from metrpo.history import History
 from metrpo.types import Episode
 from metrpo.world import dataset as datasets
 
@@ -200,6 +201,25 @@ def test_states_far_from_zero_are_counted_from_where_the_first_data_lie():
         np.testing.assert_array_equal(kept[0].deltas[at : at + 6], np.diff(near, axis=0).astype(np.float32))
     later = datasets.add(dataset, second, CONFIG, np.random.default_rng(1))
     np.testing.assert_array_equal(later.origin, dataset.origin)
+
+
+def test_what_a_history_carries_over_is_the_same_number_in_the_next_row_however_far_from_zero():
+    """A copy that had a mean of its own for its origin would jump as it is shifted."""
+    layout, rng = History(3, 2, 1), np.random.default_rng(0)
+    observed = np.array([1e8, 0.0]) + np.cumsum(rng.normal(size=(31, 2)), axis=0)
+    actions = rng.uniform(0.999, 1, (30, 1)).astype(
+        np.float32
+    )  # far from 0 by themselves, and never counted from there
+    episode = Episode(layout.along(observed, actions), actions, np.zeros(30, np.float32), False)
+    nothing = datasets.empty(layout.state_size, 1, 2)
+    rows = datasets.add(nothing, [episode], CONFIG, rng, carried=layout.carried)
+    assert rows.origin[0] == rows.origin[2] == rows.origin[4] == pytest.approx(observed[:, 0].mean(), rel=1e-7)
+    assert not rows.origin[[1, 3, 5, 6, 7]].any()
+    states, deltas = rows.train.states, rows.train.deltas
+    assert deltas.shape == (30, 2)
+    now = np.concatenate([states, rows.train.actions], axis=1)
+    np.testing.assert_array_equal(states[1:, 2:], now[:-1, list(layout.carried)])
+    np.testing.assert_allclose(states[1:, :2], states[:-1, :2] + deltas[:-1], atol=1e-5)
 
 
 def test_no_episodes_add_nothing():
