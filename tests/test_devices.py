@@ -93,7 +93,9 @@ np.savez(OUT, np.zeros(1))
 
 WIDE = """
 from jax.sharding import Mesh
+from metrpo.history import History
 from metrpo.model import imagine as module
+from metrpo.model.ensemble import Carried, Ensemble
 from metrpo.types import Trajectories
 module.CORE_CACHE = 100  # bytes; the largest layer has more
 policy = random_policy(0, 4, 2, hidden=(8,))
@@ -122,13 +124,22 @@ def found(ensemble, count, few, sampling, curiosity):
     assert 0 < float(out[1].steps) < 120, "some rollouts ended"
     return jax.device_get(out)
 
+def of_one_observation(ensemble):
+    # A state of 4 is two observations of a number and the two actions between them.
+    (*inner, (weights, biases)), n = ensemble.networks, ensemble.normaliser
+    n = n._replace(delta_mean=n.delta_mean[:1], delta_std=n.delta_std[:1])
+    return Ensemble((*inner, (weights[..., :1], biases[..., :1])), n, Carried(History(2, 1, 2).carried))
+
 for members, count, hidden, sampling, curiosity in (
+    (3, 2, (16,), "step_rand", "history"),
     (3, 4, (16,), "step_rand", 0.0),  # all three cut in four
     (4, 2, (16,), "eps_rand", 0.0),  # two each
     (5, 4, (16, 8, 8, 16), "step_rand", 0.1),
     (3, 2, (16, 16), "step_rand", 0.0),  # one each, and one cut in two
 ):
     ensemble = random_ensemble(members=members, scale=0.3, hidden=hidden)
+    if curiosity == "history":
+        ensemble, curiosity = of_one_observation(ensemble), 0.0
     rows = 24 // count // members  # for each model, on a device with models of its own
     apart = found(ensemble, count, rows, sampling, curiosity)
     assert not divided
