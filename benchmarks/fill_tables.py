@@ -12,6 +12,8 @@ import headline
 import mbbl_table
 from summarise import HEADER, ROOT, table
 
+from metrpo.report.tables import markdown_row
+
 PAGE, FIGURES = ROOT.parent / "docs" / "reproduction.md", ROOT / "laptop" / "figures"
 PAGES = {
     "docs/results.md": ["laptop/*/me-trpo"],
@@ -32,19 +34,19 @@ def with_figures(page: str) -> str:
 def with_runs(page: str, patterns: list[str]) -> str:
     """The page with its one table of runs made anew."""
     runs = table([path for pattern in patterns for path in ROOT.glob(pattern)])
-    head = re.escape(f"| {' | '.join(HEADER)} |\n")
-    return re.sub(rf"{head}(\|.*\n)+", lambda _: runs + "\n", page)
+    head = re.escape(f"{markdown_row(HEADER)}\n")
+    return re.sub(rf"{head}(\|.*\n)+", lambda _: runs, page)
 
 
 def with_mbbl(page: str) -> str:
     """The page with the table of MBBL's tasks made anew."""
-    return re.sub(r"(<!-- mbbl -->\n).*?(<!-- end -->)", rf"\1{mbbl_table.table()}\n\2", page, flags=re.DOTALL)
+    return re.sub(r"(<!-- mbbl -->\n).*?(<!-- end -->)", rf"\1{mbbl_table.table()}\2", page, flags=re.DOTALL)
 
 
 def with_headline(page: str) -> str:
     """The page with the table of `headline.py` made anew."""
-    head = re.escape(f"| {' | '.join(headline.HEADER)} |\n")
-    return re.sub(rf"{head}(\|.*\n)+", lambda _: headline.table() + "\n", page)
+    head = re.escape(f"{markdown_row(headline.HEADER)}\n")
+    return re.sub(rf"{head}(\|.*\n)+", lambda _: headline.table(), page)
 
 
 if __name__ == "__main__":

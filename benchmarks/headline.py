@@ -12,6 +12,7 @@ import numpy as np
 from summarise import ROOT
 
 from metrpo import read_metrics
+from metrpo.report.tables import markdown
 
 EXPERIMENT = "laptop"
 TASKS = ("Swimmer", "Snake", "HalfCheetah", "Hopper", "HopperUpright", "Ant", "Humanoid", "HumanoidStandup")
@@ -20,8 +21,7 @@ HEADER = ("task", "real steps", "seeds", "return", "worst seed", "doing nothing"
 
 def table() -> str:
     """As Markdown, a row for each task that has runs."""
-    rows = [HEADER, tuple("---" for _ in HEADER), *(row for task in TASKS if (row := _row(task)))]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
+    return markdown(HEADER, [row for task in TASKS if (row := _row(task))])
 
 
 def _row(task: str) -> tuple[str, ...] | None:

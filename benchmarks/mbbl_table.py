@@ -13,6 +13,7 @@ import numpy as np
 from summarise import ROOT
 
 from metrpo import read_metrics
+from metrpo.report.tables import markdown
 
 OURS = "metrpo, long-horizon"
 
@@ -33,9 +34,8 @@ def table() -> str:
     with (ROOT / "published" / "mbbl_200k.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     tasks = [name for name in rows[0] if name != "algo"]
-    cells = [["", *tasks], ["---"] * (len(tasks) + 1), [OURS, *map(ours, tasks)], *([*row.values()] for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in cells)
+    return markdown(["", *tasks], [[OURS, *map(ours, tasks)], *([*row.values()] for row in rows)])
 
 
 if __name__ == "__main__":
-    print(table())
+    print(table(), end="")

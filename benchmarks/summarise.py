@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from metrpo import read_metrics
+from metrpo.report.tables import markdown
 
 ROOT = Path(__file__).resolve().parents[1] / "results"
 HEADER = ("experiment", "task", "system", "seeds", "real steps", "last return", "best return", "last gap", "minutes")
@@ -55,9 +56,8 @@ def _value(row: Mapping[str, float | None], column: str) -> float:
 
 def table(folders: list[Path]) -> str:
     """The whole table as Markdown."""
-    rows = [HEADER, tuple("---" for _ in HEADER), *(row(system) for system in systems(folders))]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
+    return markdown(HEADER, [row(system) for system in systems(folders)])
 
 
 if __name__ == "__main__":
-    print(table([Path(argument) for argument in sys.argv[1:]] or [ROOT]))
+    print(table([Path(argument) for argument in sys.argv[1:]] or [ROOT]), end="")

@@ -37,7 +37,10 @@ def folder(tmp_path):
     for system, curves in CURVES.items():
         for seed, returns in enumerate(curves):
             config = Config("Swimmer", system=system, seed=seed)
-            a_run(tmp_path / "runs" / system / f"seed-{seed}", config, rows(returns))
+            run = a_run(tmp_path / "runs" / system / f"seed-{seed}", config, rows(returns))
+            if system == "me-trpo" and seed:  # one from before they were measured
+                measured = {"zero": {"mean": -1.0 * seed}, "random": {"mean": -10.0}}
+                (run / "run.json").write_text(json.dumps({"yardsticks": {"task": "Swimmer", **measured}}))
     a_run(tmp_path / "runs" / "other" / "seed-0", Config("Hopper"), rows([7.0, float("nan")]))
     (a_run(tmp_path / "runs" / "none" / "seed-0", Config("Ant"), []) / "run.json").write_text("{}")
     return tmp_path / "runs"
@@ -46,6 +49,8 @@ def folder(tmp_path):
 def test_numbers_are_those_worked_out_by_hand(folder):
     hopper, ours, theirs = sorted(compare(find([folder]).runs, 15.0), key=lambda one: (one.task, one.label))
     assert (ours.seeds, ours.last.value, ours.best, ours.real_steps) == (3, 24.0, 30.0, (300, 300))
+    assert (ours.worst, ours.no_skill) == (20.0, {"doing nothing": -1.5, "random actions": -10.0})
+    assert (theirs.worst, theirs.no_skill) == (2.0, {})
     assert 20.0 <= ours.last.low < 24.0 < ours.last.high <= 28.0
     # 15 is passed at 250, 175 and 100 + 11 / 26 of 100 steps.
     assert (ours.reached, ours.steps, ours.better) == (3, 175.0, None)
@@ -79,13 +84,22 @@ def test_the_table_is_written_in_every_format(ending, folder, tmp_path, capsys):
         lines = list(csv.DictReader(io.StringIO(text)))
         assert [line["last return"] for line in lines if line["system"] == "trpo"] == ["4.0"]
         assert [line["steps to it"] for line in lines if line["task"] == "Swimmer"] == ["175", "-"]
+        columns = ("worst seed", "best", "doing nothing", "random actions")
+        assert [[line[c] for c in columns] for line in lines if line["task"] == "Swimmer"] == [
+            ["20.0", "30.0", "-1.5", "-10.0"],
+            ["2.0", "6.0", "-", "-"],
+        ]
     if ending == "html":
         assert "95 % bootstrap" in Page(f"<html>{text}</html>").text
+        assert "<td>20.0</td><td>30.0</td><td>-1.5</td><td>-10.0</td>" in text
     if ending == "tex":
         assert r"Swimmer & me-trpo & 3 & 300 & 24.0" in text
-        assert r"95 \% & best" in text
+        assert r"95 \% & worst seed & best & doing nothing & random actions" in text
+        assert "& 20.0 & 30.0 & -1.5 & -10.0 &" in text
     if ending == "md":
         assert "| Swimmer | me-trpo | 3 | 300 | 24.0 |" in text
+        assert "| 20.0 | 30.0 | -1.5 | -10.0 |" in text
+        assert text.endswith("point itself.\n")
 
 
 def test_the_command_prints_a_table_or_json(folder, capsys):
@@ -98,6 +112,13 @@ def test_the_command_prints_a_table_or_json(folder, capsys):
         assert said in capsys.readouterr().err
     assert main.main(["compare", str(folder), "--out", "table.doc"]) == 2
     assert "ends in .md, .csv, .tex, .html, got .doc" in capsys.readouterr().err
+
+
+def test_steps_that_go_down_cost_no_table(tmp_path):
+    """No run writes them; a report of damaged files must come all the same."""
+    damaged = [row | {"real_steps": steps} for row, steps in zip(rows([1.0, 2.0, 3.0]), (300, 100, 200), strict=True)]
+    a_run(tmp_path / "a", Config("Swimmer"), damaged)
+    assert [one.last.value for one in compare(find([tmp_path]).runs)] == [3.0]
 
 
 # ---------------------------------------------------------------- pictures

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from metrpo.errors import ConfigError
-from metrpo.run.find import Group, SeenRun, group
+from metrpo.run.find import Group, SeenRun, group, no_skill
+from metrpo.run.yardstick_record import NAMES
 from metrpo.statistics import caveat, probability_of_improvement, steps_to_reach, stratified_bootstrap
 
 
@@ -33,8 +34,12 @@ class Compared:
     """Fewest and most of its runs."""
     last: Interval
     """Of every seed's last return."""
+    worst: float
+    """Of the seeds' last returns the lowest."""
     best: float
     """The best return of any seed at any time."""
+    no_skill: dict[str, float]
+    """What doing nothing and random actions earn, by name; empty where no run has measured it."""
     level: float
     """Return for `steps`."""
     steps: float | None
@@ -93,7 +98,9 @@ def _compared(own: Group, reference: Group, level: float) -> Compared:
         seeds=len(last),
         real_steps=(min(ends), max(ends)),
         last=_interval(np.mean, last),
+        worst=float(last.min()),
         best=max(float(np.nanmax(_returns(run))) for run in own.runs),
+        no_skill=no_skill(own.runs),
         level=level,
         steps=float(np.median(reached)) if len(reached) else None,
         reached=len(reached),
@@ -104,13 +111,20 @@ def _compared(own: Group, reference: Group, level: float) -> Compared:
 
 
 def _interval(statistic: Any, *scores: np.ndarray) -> Interval:
+    if all(len(sample) == 1 for sample in scores):  # however often one seed is redrawn
+        return Interval(*[float(statistic(*scores))] * 3)
     low, high = stratified_bootstrap(lambda *redrawn: statistic(*(sample[0] for sample in redrawn)), *scores)
     return Interval(float(statistic(*scores)), float(low), float(high))
 
 
+def has_returns(run: SeenRun) -> bool:
+    """Whether any of its episodes has been measured."""
+    return bool(np.isfinite(_returns(run)).any())
+
+
 def _measured(group: Group) -> Group:
     """The group's runs that have any return."""
-    return Group(group.task, group.label, [run for run in group.runs if np.isfinite(_returns(run)).any()])
+    return Group(group.task, group.label, [run for run in group.runs if has_returns(run)])
 
 
 def _returns(run: SeenRun) -> np.ndarray:
@@ -126,14 +140,17 @@ def _last(group: Group) -> np.ndarray:
 
 def _steps(run: SeenRun, level: float) -> float:
     steps, returns = run.column("real_steps"), _returns(run)
-    grows = np.append(True, np.diff(steps) > 0)[: len(steps)]  # --real-steps 0 collects none
+    grows = steps > np.append(-np.inf, np.maximum.accumulate(steps))[:-1]  # --real-steps 0 collects none
     return steps_to_reach(steps[grows], returns[grows], level)
 
 
 # ---------------------------------------------------------------- tables
 
 
-HEADER = ("task", "system", "seeds", "real steps", "last return", "95 %", "best", "level", "steps to it", "better")
+HEADER = (
+    *("task", "system", "seeds", "real steps", "last return", "95 %", "worst seed", "best"),
+    *(*NAMES.values(), "level", "steps to it", "better"),
+)
 
 
 def cells(one: Compared) -> tuple[str, ...]:
@@ -146,13 +163,19 @@ def cells(one: Compared) -> tuple[str, ...]:
         one.label,
         str(one.seeds),
         f"{few:,}" if few == most else f"{few:,} to {most:,}",
-        f"{one.last.value:.1f}",
-        f"{one.last.low:.1f} to {one.last.high:.1f}" if one.seeds > 1 else "-",
-        f"{one.best:.1f}",
-        f"{one.level:.1f}",
+        _return(one.last.value),
+        f"{_return(one.last.low)} to {_return(one.last.high)}" if one.seeds > 1 else "-",
+        _return(one.worst),
+        _return(one.best),
+        *(_return(one.no_skill[name]) if name in one.no_skill else "-" for name in NAMES.values()),
+        _return(one.level),
         "-" if one.steps is None else f"{one.steps:,.0f}{reached}",
         better,
     )
+
+
+def _return(value: float) -> str:
+    return f"{value:.1f}" if abs(value) < 1e9 else f"{value:.2g}"
 
 
 def _range(interval: Interval, digits: int) -> str:
@@ -163,8 +186,8 @@ def _range(interval: Interval, digits: int) -> str:
 def notes(found: Sequence[Compared]) -> list[str]:
     """What a reader of the table must know."""
     said = [
-        "last return: mean over seeds of the last evaluation, with its 95 % bootstrap interval; steps to it: median "
-        "real steps to the level, of the seeds that reach it; better: probability that a seed earns more than one of "
-        "the reference."
+        "last return: mean over seeds of the last evaluation, with its 95 % bootstrap interval; worst seed: the "
+        "lowest of them; best: of any seed at any time; steps to it: median real steps to the level, of the seeds that "
+        "reach it; better: probability that a seed earns more than one of the reference."
     ]
     return said + list(dict.fromkeys(one.caveat for one in found if one.caveat))

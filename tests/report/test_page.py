@@ -94,6 +94,31 @@ def test_the_page_shows_what_it_must(tmp_path):
     assert page(find([tmp_path]), tmp_path) == text, "the same runs give the same page"
 
 
+def test_several_runs_begin_with_their_groups(tmp_path):
+    for seed in (0, 1, 2):
+        run = a_run(tmp_path / f"a/{seed}", dataclasses.replace(CONFIG, seed=seed), healthy(12 - seed))
+        yardsticks = {"task": "Swimmer", "zero": {"mean": -1.25}, "random": {"mean": -7.0}}
+        (run / "run.json").write_text(json.dumps({"yardsticks": yardsticks}))
+    a_run(tmp_path / "b", ONE, [r | {"return_real": 1e300} for r in healthy()])
+    text = page(find([tmp_path]), tmp_path)
+    groups, health = text.index('<section id="groups">'), text.index('<section id="health">')
+    assert groups < health, "first"
+    ours, theirs = text[groups:health].split("<tbody>")[1].split("<tr>")[1:]
+    last = [healthy(n)[-1]["return_real"] for n in (12, 11, 10)]
+    for cell in ("3", "30,000 to 36,000", f"{sum(last) / 3:.1f}", f"{min(last):.1f}", "-1.2", "-7.0"):
+        assert f"<td>{cell}</td>" in ours, cell
+    assert 'class="swatch c0"></i>me-trpo<' in ours
+    assert "<td>1e+300</td>" in theirs
+    assert record(find([tmp_path]))["groups"][0]["worst"] == min(last)
+    alone = find([tmp_path / "b"])
+    assert ('id="groups"' in page(alone, tmp_path), record(alone)["groups"]) == (False, []), "a run is no group"
+    (tmp_path / "none").mkdir()
+    for seed in (0, 1):
+        rows = [r | {"return_real": float("nan")} for r in healthy()]
+        a_run(tmp_path / f"none/{seed}", dataclasses.replace(CONFIG, seed=seed), rows)
+    assert 'id="groups"' not in page(find([tmp_path / "none"]), tmp_path), "nothing has been measured"
+
+
 def test_what_a_run_says_is_text_and_no_markup(tmp_path):
     evil = dataclasses.replace(CONFIG, task='" onload="1" <script>alert("x")</script>&amp;\'')
     rows = [{**r, "<img src=x onerror=alert(1)>": 1.0, "diverged": 0.5} for r in healthy()]

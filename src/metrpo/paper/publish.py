@@ -41,11 +41,12 @@ def publish(
             tell(f"{name}: nothing to draw yet")
             continue
         numbers[name] = summarise(name, runs, out)
+        table = as_markdown(numbers[name])
         # A level that was not reached is NaN, which is no JSON.
         text = json.dumps(numbers[name], indent=1).replace("NaN", "null")
         atomic_write(path.with_suffix(".json"), text + "\n")
-        atomic_write(path.with_suffix(".md"), as_markdown(numbers[name]) + "\n")
-        tell(f"\n{FIGURES[name].title}: {path}\n{as_markdown(numbers[name])}")
+        atomic_write(path.with_suffix(".md"), table)
+        tell(f"\n{FIGURES[name].title}: {path}\n{table.rstrip()}")
     return numbers
 
 

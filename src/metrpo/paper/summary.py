@@ -11,6 +11,7 @@ import numpy as np
 from metrpo.launch.run_spec import RunSpec
 from metrpo.launch.status import rows_of
 from metrpo.paper.figures import FIGURES
+from metrpo.report.tables import markdown
 from metrpo.run.metrics import Row, column
 from metrpo.statistics import (
     at_steps,
@@ -122,8 +123,7 @@ def as_markdown(records: Sequence[dict[str, Any]]) -> str:
         "P(first better) at, average",
         "steps to 95 % of the first's gain",
     )
-    rows = [heads, tuple("---" for _ in heads), *(_cells(r) for r in records)]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows)
+    return markdown(heads, [_cells(r) for r in records])
 
 
 def _cells(r: dict[str, Any]) -> tuple[str, ...]:

@@ -13,8 +13,10 @@ from metrpo.console.progress import duration
 from metrpo.counting import counted
 from metrpo.report import charts
 from metrpo.report.charts import number
+from metrpo.report.group_table import compared, group_section
 from metrpo.report.panels import Budget, Seen, task_section
 from metrpo.report.style import STYLE
+from metrpo.report.tables import html_table
 from metrpo.run.find import FoundRuns, Group, SeenRun, group, is_finished, settings
 
 VIDEO_BYTES = 3_000_000
@@ -34,6 +36,7 @@ def page(found: FoundRuns, folder: Path) -> str:
     tasks = list(dict.fromkeys(s.group.task for s in seen))
     body = [
         f"<header><h1>{escape(', '.join(tasks) or 'No task')}</h1><p>{_summary(seen)}</p></header>",
+        group_section(compared(runs), {(s.group.task, s.group.label): s.colour for s in seen}),
         _health(seen, found),
         _table(seen),
     ]
@@ -53,10 +56,12 @@ def page(found: FoundRuns, folder: Path) -> str:
 
 
 def record(found: FoundRuns) -> dict[str, Any]:
-    """What the report says, for scripts: the runs with their numbers and warnings, what was skipped, and how the groups
-    of runs differ. NaN is None."""
-    groups = group([run for run in found.runs if run.rows])
+    """What the report says, for scripts: the groups, the runs with their numbers and warnings, what was skipped, and
+    how the groups differ. NaN is None."""
+    runs = [run for run in found.runs if run.rows]
+    groups = group(runs)
     return {
+        "groups": [one.plain() for one in compared(runs)],
         "runs": [
             {
                 "path": str(s.run.path),
@@ -145,13 +150,11 @@ def _table(seen: list[Seen]) -> str:
         task = f"{escape(s.group.task)}, " if several else ""
         name = f'<i class="swatch {s.colour}"></i>{task}{escape(s.name)}'
         rows.append(
-            f'<tr><th scope="row" title="{escape(str(run.path), quote=True)}">{name}</th>'
-            f"{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
+            (f'<span title="{escape(str(run.path), quote=True)}">{name}</span>', *cells),
         )
-    head = "".join(f'<th scope="col">{h}</th>' for h in heads)
     return (
-        f'<section id="runs"><h2>Runs</h2><div class="scroll"><table><thead><tr>{head}</tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table></div><p class=small>Returns are real, of the deterministic policy, "
+        f'<section id="runs"><h2>Runs</h2><div class="scroll">{html_table(heads, rows)}</div>'
+        "<p class=small>Returns are real, of the deterministic policy, "
         "± their standard deviation over episodes; the gap is imagined minus real return.</p></section>"
     )
 
@@ -163,16 +166,12 @@ def _differences(groups: list[Group]) -> str:
         return f"<section><h2>Settings</h2><p>{text}</p></section>" if text else ""
     tasks = len({g.task for g in groups}) > 1
     heads = [f"{g.task}, {g.label}" if tasks else g.label for g in groups]
-    head = "".join(f'<th scope="col">{escape(h)}</th>' for h in ["setting", *heads])
-    rows = "".join(
-        f'<tr><th scope="row"><code>{escape(name)}</code></th>'
-        f"{''.join(f'<td>{escape(_text(value))}</td>' for value in values)}</tr>"
+    rows = [
+        [f"<code>{escape(name)}</code>", *(escape(_text(value)) for value in values)]
         for name, values in different.items()
-    )
-    return (
-        f'<section><h2>Settings that differ</h2><div class="scroll"><table><thead><tr>{head}</tr></thead>'
-        f"<tbody>{rows}</tbody></table></div></section>"
-    )
+    ]
+    table = html_table(["setting", *map(escape, heads)], rows)
+    return f'<section><h2>Settings that differ</h2><div class="scroll">{table}</div></section>'
 
 
 def _different(groups: list[Group]) -> dict[str, list[object]]:

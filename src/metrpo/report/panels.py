@@ -18,7 +18,7 @@ from metrpo.report import charts
 from metrpo.report.caption import figure, swatches
 from metrpo.report.charts import Line, bars, chart
 from metrpo.report.trust import trust_of
-from metrpo.run.find import Group, SeenRun
+from metrpo.run.find import Group, SeenRun, no_skill
 from metrpo.run.metrics import is_clock
 
 _QUANTITIES = (
@@ -119,7 +119,7 @@ def _learning(task: str, seen: list[Seen], groups: list[Group], colours: dict[in
         if len(c.seeds) > 1:
             lines += [Line(*seed, g.label, f"{colour} thin", dots=False) for seed in c.seeds]
         lines.append(Line(c.x, c.mean, g.label, f"{colour} thick", len(c.seeds) == 1, c.low, c.high))
-    levels = _yardsticks(seen)
+    levels = no_skill([s.run for s in seen])
     lines += [Line(_ends(lines), np.full(2, level), name, "level dashed", False) for name, level in levels.items()]
     title = f"Learning curves of {task}"
     wide = chart(title, lines, x_label, y_label, size=(1120, 340), log=log)
@@ -133,12 +133,6 @@ def _learning(task: str, seen: list[Seen], groups: list[Group], colours: dict[in
         f"{_legend(groups, colours)}<figure class=wide>{wide}</figure><figure class=narrow>{narrow}</figure>"
         f'<p class="small">{what} against {x_label}.{said}</p>'
     )
-
-
-def _yardsticks(seen: list[Seen]) -> dict[str, float]:
-    """What no skill earns on the task, by name: the mean over the runs that have measured it."""
-    found = [s.run.yardsticks for s in seen if s.run.yardsticks]
-    return {name: float(np.mean([one[name] for one in found])) for name in (found[0] if found else {})}
 
 
 def _ends(lines: list[Line]) -> np.ndarray:

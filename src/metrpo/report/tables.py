@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from metrpo.errors import ConfigError
 
 Rows = Sequence[Sequence[str]]
+_BAR = "\\|"
 _TEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"} | {
     sign: f"\\{sign}" for sign in "&%$#_{}"
 }
@@ -22,10 +23,22 @@ def written(kind: str, header: Sequence[str], rows: Rows, notes: Sequence[str]) 
     return KINDS[kind](header, rows, notes)
 
 
-def markdown(header: Sequence[str], rows: Rows, notes: Sequence[str]) -> str:
+def markdown(header: Sequence[str], rows: Rows, notes: Sequence[str] = ()) -> str:
     """A table for READMEs."""
-    cells = [[cell.replace("|", "\\|") for cell in row] for row in (header, ["---"] * len(header), *rows)]
-    return "\n".join([*(f"| {' | '.join(row)} |" for row in cells), "", *notes, ""])
+    lines = [markdown_row(row) for row in (header, ["---"] * len(header), *rows)]
+    return "\n".join([*lines, *(["", *notes] if notes else []), ""])
+
+
+def markdown_row(cells: Sequence[str]) -> str:
+    """A line of it."""
+    return f"| {' | '.join(cell.replace('|', _BAR) for cell in cells)} |"
+
+
+def html_table(header: Sequence[str], rows: Rows) -> str:
+    """A table of cells that are HTML; the first cell of a row is its head."""
+    head = "".join(f'<th scope="col">{cell}</th>' for cell in header)
+    lines = [f'<tr><th scope="row">{row[0]}</th>{"".join(f"<td>{cell}</td>" for cell in row[1:])}</tr>' for row in rows]
+    return f"<table>\n<thead><tr>{head}</tr></thead>\n<tbody>\n{chr(10).join(lines)}\n</tbody>\n</table>"
 
 
 def _csv(header: Sequence[str], rows: Rows, notes: Sequence[str]) -> str:
@@ -45,12 +58,9 @@ def _latex(header: Sequence[str], rows: Rows, notes: Sequence[str]) -> str:
 
 
 def _html(header: Sequence[str], rows: Rows, notes: Sequence[str]) -> str:
-    def line(cells: Sequence[str], tag: str) -> str:
-        return "<tr>" + "".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in cells) + "</tr>"
-
-    body = "\n".join(line(row, "td") for row in rows)
+    head, *body = ([html.escape(cell) for cell in row] for row in (header, *rows))
     below = "\n".join(f"<p>{html.escape(note)}</p>" for note in notes)
-    return f"<table>\n<thead>{line(header, 'th')}</thead>\n<tbody>\n{body}\n</tbody>\n</table>\n{below}\n"
+    return f"{html_table(head, body)}\n{below}\n"
 
 
 KINDS: dict[str, Callable[[Sequence[str], Rows, Sequence[str]], str]] = {

@@ -148,6 +148,12 @@ def group(runs: Sequence[SeenRun]) -> list[Group]:
     return groups
 
 
+def no_skill(runs: Sequence[SeenRun]) -> dict[str, float]:
+    """What no skill earns on the runs' task, by name: the mean over the runs that have measured it, empty for none."""
+    measured = [run.yardsticks for run in runs if run.yardsticks]
+    return {name: float(np.mean([one[name] for one in measured])) for name in (measured[0] if measured else {})}
+
+
 def settings(old: Config, new: Config) -> dict[str, tuple[object, object]]:
     """Settings that differ, seed and budget aside: `{"ensemble.members": (1, 5)}`."""
     return {name: values for name, values in difference(old, new).items() if name != "seed"}
