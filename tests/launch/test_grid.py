@@ -95,7 +95,7 @@ def test_lists_may_be_given_at_once_or_one_by_one(lines):
 
 
 def test_a_setting_is_given_once():
-    with pytest.raises(ConfigError, match=r"set: expected each setting once, got trpo.max_kl, trpo.max_kl"):
+    with pytest.raises(ConfigError, match=r"set: expected each once, got trpo.max_kl, trpo.max_kl"):
         told("--set trpo.max_kl=0.1 --set trpo.max_kl=0.2")
 
 
@@ -114,6 +114,36 @@ def test_a_budget_is_each_runs_and_names_no_folder(tmp_path):
     (tmp_path / "grid.toml").write_text('tasks = ["Swimmer"]\niterations = 3\nreal_steps = 4')
     with pytest.raises(ConfigError, match="got both"):
         from_file(tmp_path / "grid.toml").runs()
+
+
+def test_systems_may_have_budgets_of_their_own(tmp_path):
+    runs = told("--systems me-trpo trpo k-1 --seeds 0 --iterations 4 --budget trpo=90000 me-trpo=3000").runs()
+    found = {run.system: (run.config.iterations, run.config.real_steps) for run in runs}
+    assert {system: steps for system, (_, steps) in found.items()} == {"me-trpo": 3000, "trpo": 90000, "k-1": None}
+    assert found["k-1"] == (4, None)
+    assert [run.name for run in runs] == [run.name for run in told("--systems me-trpo trpo k-1 --seeds 0").runs()]
+    assert ["--real-steps 90000" in " ".join(run.arguments) for run in runs] == [False, True, False]
+    file = tmp_path / "grid.toml"
+    head = 'tasks = ["Swimmer"]\nsystems = ["me-trpo", "trpo", "k-1"]\nseeds = [0]\niterations = 4\n'
+    file.write_text(f"{head}[budget]\ntrpo = 90000\nme-trpo = 3000\n")
+    assert from_file(file).runs() == runs
+    for words, message in (
+        ("--budget trpo=9", r"budget: expected a system of the grid \(me-trpo\), got trpo"),
+        ("--budget me-trpo", "budget: expected SYSTEM=REAL_STEPS such as trpo=300000, got 'me-trpo'"),
+        ("--budget me-trpo=1e6", "budget: expected SYSTEM=REAL_STEPS"),
+        ("--budget me-trpo=-1", "real_steps: expected at least 0"),
+        ("--budget me-trpo=1 me-trpo=2", "budget: expected each once, got me-trpo, me-trpo"),
+        ("--budget me-trpo=1 --set real_steps=2", "set: real_steps: expected the budget in one place"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            told(words).runs()
+    for text, message in (('trpo = "many"', "real_steps: expected"), ("trpo = 1.5", "real_steps: expected")):
+        file.write_text(f"{head}[budget]\n{text}\n")
+        with pytest.raises(ConfigError, match=message):
+            from_file(file).runs()
+    file.write_text(f"{head}budget = 3\n")
+    with pytest.raises(ConfigError, match="budget: expected a table of systems and their real steps, got 3"):
+        from_file(file)
 
 
 def test_a_file_stands_alone():

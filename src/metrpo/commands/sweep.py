@@ -29,18 +29,20 @@ class Sweep:
     For example:
         metrpo sweep --tasks Swimmer HalfCheetah --seeds 0:5 --out runs/seeds
         metrpo sweep --set ensemble.members=1,5,10 trpo.max_kl=0.01,0.03 --jobs 4
+        metrpo sweep --systems me-trpo trpo --real-steps 30000 --budget trpo=300000
         metrpo sweep grid.toml --dry-run
         metrpo sweep grid.toml --backend ray --out /shared/sweep
 
     where grid.toml holds, say:
         tasks = ["Swimmer"]
         seeds = "0:3"
+        budget.me-trpo = 30000
         set.ensemble.members = [1, 5, 10]
     """
 
     spec: Annotated[Positional[Path | None], arg(metavar="SPEC")] = None
-    """The grid as a TOML file: tasks, systems, seeds, iterations or real_steps, preset and a table [set]; instead of
-    the options of these names."""
+    """The grid as a TOML file: tasks, systems, seeds, iterations or real_steps, preset and tables [budget] and [set];
+    instead of the options of these names."""
     tasks: Annotated[tuple[str, ...], arg(metavar="TASK...")] = ("Swimmer",)
     """Tasks, as metrpo train takes them."""
     systems: Annotated[tuple[System, ...], arg(metavar="NAME...")] = ("me-trpo",)
@@ -51,6 +53,8 @@ class Sweep:
     """Outer iterations of every run; default: the preset's. May be raised later to go on with finished runs."""
     real_steps: Annotated[int | None, arg(metavar="INT")] = None
     """Instead of --iterations: real steps of every run."""
+    budget: Annotated[tuple[str, ...], arg(metavar="SYSTEM=STEPS...")] = ()
+    """Real steps of single systems' runs, instead of the above: trpo=300000 ppo=300000."""
     preset: Preset = "fast"
     """What all other settings start from."""
     set: Annotated[tuple[str, ...], arg(metavar="NAME=VALUES...")] = ()
@@ -83,10 +87,11 @@ def run(command: Sweep) -> int:
 
 def grid_of(command: Sweep) -> Grid:
     """The grid that the options describe. Raises `ConfigError` for what is none."""
-    from metrpo.launch.grid import Grid, require_once, seeds_of, values_of
+    from metrpo.launch.grid import Grid, budget_of, require_once, seeds_of, values_of
 
-    settings = [values_of(text) for text in command.set]
+    settings, budgets = [values_of(text) for text in command.set], [budget_of(text) for text in command.budget]
     require_once("set", [name for name, _ in settings])
+    require_once("budget", [name for name, _ in budgets])
     return Grid(
         command.tasks,
         command.systems,
@@ -95,4 +100,5 @@ def grid_of(command: Sweep) -> Grid:
         dict(settings),
         command.iterations,
         command.real_steps,
+        dict(budgets),
     )

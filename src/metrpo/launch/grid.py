@@ -36,6 +36,8 @@ class Grid:
     iterations: int | None = None
     real_steps: int | None = None
     """The budget of every run, one of the two; default: the preset's. It names no folder, for it may be raised."""
+    budgets: Mapping[str, int] = field(default_factory=dict)
+    """System -> its runs' real steps, instead of that budget: a method without models needs more than one with them."""
 
     def runs(self) -> list[RunSpec]:
         """Every run of the grid, first seeds first.
@@ -46,15 +48,13 @@ class Grid:
         names, columns = list(self.settings), [list(values) for values in self.settings.values()]
         if not self.tasks or not self.systems or not self.seeds or not all(columns):
             raise ConfigError("sweep: expected at least one task, system, seed and value of each setting, got none")
-        budget = tuple((n, v) for n in BUDGET_FIELDS if (v := getattr(self, n)) is not None)
-        if len(budget) > 1:
-            raise ConfigError("sweep: expected iterations or real_steps, got both; leave one out")
-        if twice := [name for name in names if budget and name in BUDGET_FIELDS]:
+        if unknown := [s for s in self.systems if s not in get_args(System)]:
+            raise ConfigError(f"sweep: systems: expected some of {', '.join(get_args(System))}, got {unknown[0]}")
+        budgets = self._budgets()
+        if twice := [name for name in names if any(budgets.values()) and name in BUDGET_FIELDS]:
             raise ConfigError(
                 f"set: {twice[0]}: expected the budget in one place, got it as an option too; leave one out"
             )
-        if unknown := [s for s in self.systems if s not in get_args(System)]:
-            raise ConfigError(f"sweep: systems: expected some of {', '.join(get_args(System))}, got {unknown[0]}")
         found = []
         for seed, given, system, values in itertools.product(
             self.seeds, self.tasks, self.systems, itertools.product(*columns)
@@ -63,14 +63,25 @@ class Grid:
             made = dict(overrides)
             task = get_task(given, made.get("env_kwargs", ()), made.get("imports", ())).name
             variant = _variant(system, overrides)
-            found.append(RunSpec(task, system, seed, budget + overrides, self.preset, variant))
+            found.append(RunSpec(task, system, seed, budgets[system] + overrides, self.preset, variant))
         for run in found:
             _ = run.config
         return list(dict.fromkeys(found))
 
+    def _budgets(self) -> dict[str, tuple[tuple[str, Any], ...]]:
+        """By system what its runs' settings say of the budget."""
+        usual = tuple((n, v) for n in BUDGET_FIELDS if (v := getattr(self, n)) is not None)
+        if len(usual) > 1:
+            raise ConfigError("sweep: expected iterations or real_steps, got both; leave one out")
+        if unknown := [s for s in self.budgets if s not in self.systems]:
+            raise ConfigError(f"budget: expected a system of the grid ({', '.join(self.systems)}), got {unknown[0]}")
+        own = {system: (("real_steps", steps),) for system, steps in self.budgets.items()}
+        return {system: own.get(system, usual) for system in self.systems}
+
 
 def from_file(path: Path) -> Grid:
-    """The grid in a TOML file: tasks, systems, seeds (a list or "0:5"), preset, budget, and a table [set] of settings.
+    """The grid in a TOML file: tasks, systems, seeds (a list or "0:5"), preset, budget, and tables [budget] of single
+    systems' real steps and [set] of settings.
 
     Raises `ConfigError` when it cannot be read or says something else.
     """
@@ -78,23 +89,36 @@ def from_file(path: Path) -> Grid:
         spec = tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ConfigError(f"{path}: expected a TOML file with tasks, seeds and [set], got {error}") from error
-    settings = spec.pop("set", {})
+    settings, budgets = spec.pop("set", {}), spec.pop("budget", {})
     plain = ("preset", *BUDGET_FIELDS)
     if unknown := [key for key in spec if key not in ("tasks", "systems", "seeds", *plain)]:
-        raise ConfigError(f"{path}: expected tasks, systems, seeds, {', '.join(plain)} and [set], got {unknown[0]}")
+        raise ConfigError(
+            f"{path}: expected tasks, systems, seeds, {', '.join(plain)}, [budget] and [set], got {unknown[0]}"
+        )
     if isinstance(spec.get("seeds"), str):
         spec["seeds"] = seeds_of(spec["seeds"])
     if not isinstance(settings, dict) or not all(isinstance(spec.get(k, []), list | tuple) for k in ("tasks", "seeds")):
         raise ConfigError(f"{path}: expected lists of tasks and seeds, and a table [set]")
     lists = {key: value if key in plain else tuple(value) for key, value in spec.items()}
     columns = {name: value if isinstance(value, list) else [value] for name, value in flat(settings).items()}
-    return Grid(**cast(Any, {"tasks": (), **lists, "settings": columns}))
+    if not isinstance(budgets, dict):
+        raise ConfigError(f"{path}: budget: expected a table of systems and their real steps, got {budgets}")
+    return Grid(**cast(Any, {"tasks": (), **lists, "settings": columns, "budgets": budgets}))
+
+
+def budget_of(text: str) -> tuple[str, int]:
+    """A system with its real steps as typed: "trpo=300000". Raises `ConfigError` for anything else."""
+    system, _, steps = text.partition("=")
+    try:
+        return system, int(steps)
+    except ValueError:
+        raise ConfigError(f"budget: expected SYSTEM=REAL_STEPS such as trpo=300000, got {text!r}") from None
 
 
 def require_once(option: str, names: Sequence[str]) -> None:
     """Raises `ConfigError` when an option is to set something twice."""
     if len(set(names)) < len(names):
-        raise ConfigError(f"{option}: expected each setting once, got {', '.join(names)}")
+        raise ConfigError(f"{option}: expected each once, got {', '.join(names)}")
 
 
 def seeds_of(text: str) -> tuple[int, ...]:
