@@ -19,15 +19,13 @@ import numpy as np
 from metrpo import load_policy, zoo
 from metrpo.errors import MetrpoError, TaskError
 from metrpo.policy.gaussian import Policy
-from metrpo.run.about import about
+from metrpo.run.card import card_of
 from metrpo.run.files import folder_name, read_arrays
 from metrpo.run.find import SeenRun, find
 from metrpo.run.policy_file import FILE, save_policy
 from metrpo.world.registry import task_for
 
 RESULTS = Path(__file__).resolve().parents[2] / "results"
-POINTS = 12
-"""Of a card's learning curve."""
 
 
 def candidates(folders: list[Path]) -> dict[str, list[SeenRun]]:
@@ -52,29 +50,13 @@ def add(runs: list[SeenRun], floor: float | None, folder: Path) -> None:
     best = max(runs, key=lambda run: _return(run) or -np.inf)
     info, (arrays, _) = load_policy(best.path).info, read_arrays(best.path / FILE)
     layers = tuple((arrays[f"w{i}"], arrays[f"b{i}"]) for i in range(len(info.hidden) + 1))
-    policy, task, made = Policy(layers, arrays["log_std"]), task_for(best.config), about(best.path)
+    policy, task = Policy(layers, arrays["log_std"]), task_for(best.config)
     folder.mkdir(parents=True)
     numbers = (info.iteration, info.real_steps, info.return_real)
     origin = arrays.get("origin")
     save_policy(folder, policy, info.task, *numbers, task.interface, origin, best.config)  # type: ignore[arg-type]
-    steps, returns = best.column("real_steps"), best.column("return_real")
-    there = np.flatnonzero(np.isfinite(returns))
-    shown = there[np.unique(np.linspace(0, len(there) - 1, POINTS).astype(int))]
-    card = {
-        "task": info.task,
-        "return": info.return_real,
-        "no_skill": floor,
-        "real_steps": info.real_steps,
-        "system": best.config.system,
-        "preset": best.config.preset,
-        "seed": best.config.seed,
-        "chosen_of": len(runs),
-        "mean_of_runs": float(np.mean([_return(run) for run in runs])),
-        "run": _name_of(best.path),
-        "commit": made.get("commit"),
-        "created": str(made.get("created", ""))[:10] or None,
-        "curve": [[int(steps[i]), round(float(returns[i]), 2)] for i in shown],
-    }
+    chosen = {"chosen_of": len(runs), "mean_of_runs": float(np.mean([_return(run) for run in runs]))}
+    card = {**card_of(best), "no_skill": floor, **chosen, "run": _name_of(best.path)}
     (folder / zoo.CARD).write_text(json.dumps(card, indent=1) + "\n", "utf-8")
 
 

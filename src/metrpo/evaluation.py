@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from metrpo.counting import counted
 from metrpo.errors import ConfigError, TaskError
+from metrpo.hub import is_on_hub
 from metrpo.limits import Limits
 from metrpo.run.policy_file import LoadedPolicy, PolicyInfo, load_policy
 from metrpo.run.task_file import task_of_run
@@ -20,7 +21,7 @@ from metrpo.world import collect
 from metrpo.world.history_env import with_history
 from metrpo.world.registry import get_task, limited
 from metrpo.world.task import Task
-from metrpo.zoo import FOLDER, located
+from metrpo.zoo import is_in_zoo, is_name, located
 
 
 @dataclass(frozen=True)
@@ -73,14 +74,14 @@ def evaluate(
     if episodes < 1:
         raise ConfigError(f"episodes: expected at least 1, got {episodes}")
     _require_seed(seed)
-    act = load_policy(policy) if isinstance(policy, str | Path) else policy
+    act = _loaded(policy) if isinstance(policy, str | Path) else policy
     if task is not None or not isinstance(act, LoadedPolicy):
         if task is None:
             raise ConfigError("task: expected the task that this function is to be evaluated on, got none")
         known = _task_at(task, act.info if isinstance(act, LoadedPolicy) else None)
     else:
         made = act.info
-        of_run = task_of_run(located(policy), made) if isinstance(policy, str | Path) else None
+        of_run = _task_of(policy, made) if isinstance(policy, str | Path) else None
         known = of_run or get_task(made.task, made.env_kwargs, made.imports)
     if isinstance(act, LoadedPolicy):
         _require_fit(act, known)
@@ -91,7 +92,7 @@ def evaluate(
 
 def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0, task: str | None = None) -> Path:
     """Records one real episode of a run's policy, by default to `video.mp4` in the run directory (of
-    `zoo:NAME`, to `NAME.mp4` here); returns the file.
+    `zoo:NAME` or `hub:OWNER/NAME`, to `NAME.mp4` here); returns the file.
 
     `task` says where the run's task is, if its file has moved.
 
@@ -99,13 +100,29 @@ def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0, ta
     encode or write it, `ConfigError` for a seed below 0.
     """
     _require_seed(seed)
-    policy = load_policy(run_dir)
-    run_dir = located(run_dir)
-    known = task_of_run(run_dir, policy.info) if task is None else _task_at(task, policy.info)
+    policy = _loaded(run_dir)
+    known = _task_of(run_dir, policy.info) if task is None else _task_at(task, policy.info)
     _require_fit(policy, known)
     policy.reset()
-    beside = Path(f"{run_dir.name}.mp4") if run_dir.parent == FOLDER else run_dir / "video.mp4"
+    name = located(run_dir).name if is_in_zoo(run_dir) else Path(run_dir).name
+    beside = Path(f"{name}.mp4") if is_name(run_dir) else Path(run_dir) / "video.mp4"
     return record(known.make_env, policy, Path(out or beside), seed)
+
+
+def _loaded(place: str | Path) -> LoadedPolicy:
+    """The policy of a place; one from the hub without its author's imports, which nobody here has asked for."""
+    policy = load_policy(place)
+    return replace(policy, info=replace(policy.info, imports=())) if is_on_hub(place) else policy
+
+
+def _task_of(place: str | Path, made: PolicyInfo) -> Task:
+    """The task of a place's policy. Raises `TaskError` where a policy from the hub would have code of that name run."""
+    if is_on_hub(place) and ":" in made.task:
+        raise TaskError(
+            f"{place}: its author's task is {brief(made.task)}, and a name from elsewhere runs no code here; say "
+            "what to play: --task path/to/file.py:name or module:name"
+        )
+    return task_of_run(located(place), made)
 
 
 def _task_at(task: str, made: PolicyInfo | None) -> Task:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from metrpo.errors import RunDirectoryError
+from metrpo.hub import downloaded, is_on_hub
 
 FOLDER = Path(__file__).with_name("zoo_policies")
 _PREFIX, CARD = "zoo:", "card.json"
@@ -27,11 +28,19 @@ def is_in_zoo(place: str | Path) -> bool:
     return str(place).startswith(_PREFIX)
 
 
-def located(place: str | Path) -> Path:
-    """The folder of `zoo:NAME` (case does not matter, "/" is "-"); of any other place the place itself.
+def is_name(place: str | Path) -> bool:
+    """Whether a place is a policy's name, `zoo:NAME` or `hub:OWNER/NAME`, so that nothing may be written beside it."""
+    return is_in_zoo(place) or is_on_hub(place)
 
-    Raises `RunDirectoryError` when there is no such policy.
+
+def located(place: str | Path) -> Path:
+    """The folder of `zoo:NAME` (case does not matter, "/" is "-"), or to which `hub:OWNER/NAME` has been downloaded; of
+    any other place the place itself.
+
+    Raises `RunDirectoryError` when there is no such policy, `MetrpoError` for one on the hub without the extra.
     """
+    if is_on_hub(place):
+        return downloaded(place)
     if not is_in_zoo(place):
         return Path(place)
     asked = str(place).removeprefix(_PREFIX)

@@ -26,6 +26,7 @@ COMMANDS: dict[str, dict[str, str]] = {
         "evaluate": "Play real episodes and say what they earn",
         "render": "Record an episode as a video",
         "export": "Write the policy as one file without metrpo",
+        "push": "Send the policy to the Hugging Face hub",
     },
     "Many runs": {
         "sweep": "Run a grid of tasks, seeds and settings",

@@ -23,7 +23,7 @@ class Evaluate:
     """
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
-    """The run directory, or zoo:NAME (see: metrpo zoo)."""
+    """The run directory, zoo:NAME (see: metrpo zoo), or hub:OWNER/NAME on the Hugging Face hub."""
     episodes: int = 20
     """How many."""
     seed: int = 0

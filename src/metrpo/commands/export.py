@@ -20,7 +20,7 @@ class Export:
     """
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
-    """The run directory, or zoo:NAME (see: metrpo zoo)."""
+    """The run directory, zoo:NAME (see: metrpo zoo), or hub:OWNER/NAME on the Hugging Face hub."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """File to write, .py, .onnx or .npz; default: policy.py in the run directory; missing folders are made."""
 

@@ -19,7 +19,7 @@ class Render:
     """
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
-    """The run directory, or zoo:NAME (see: metrpo zoo)."""
+    """The run directory, zoo:NAME (see: metrpo zoo), or hub:OWNER/NAME on the Hugging Face hub."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """File to write, .mp4 or .gif; default: video.mp4 in the run directory; missing folders are made."""
     seed: int = 0

@@ -25,7 +25,7 @@ from metrpo.limits import Limits
 from metrpo.run.files import atomic_write, metrpo_version
 from metrpo.run.policy_file import FILE, LoadedPolicy, load_policy, with_interface
 from metrpo.safe_load import opened
-from metrpo.zoo import is_in_zoo, located
+from metrpo.zoo import is_name, located
 
 _Writer = Callable[[LoadedPolicy, Path], bytes | str]
 _IMPORTED = ("base64", "hashlib", "numpy")
@@ -45,10 +45,8 @@ def export(run_dir: Path, out: Path | None = None) -> Path:
     or when the onnx package is missing, `RunDirectoryError` when there is no policy, it is damaged, or `out` cannot be
     written.
     """
-    if out is None and is_in_zoo(run_dir):
-        raise MetrpoError(
-            f"{run_dir}: expected where to write it, for the zoo is no run directory; add --out policy.py"
-        )
+    if out is None and is_name(run_dir):
+        raise MetrpoError(f"{run_dir}: expected where to write it, for it is no run directory; add --out policy.py")
     run_dir = located(run_dir)
     source = run_dir if run_dir.suffix == ".npz" else run_dir / FILE
     out = source.with_name("policy.py") if out is None else out

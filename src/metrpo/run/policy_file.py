@@ -276,7 +276,8 @@ def with_interface(info: PolicyInfo, interface: Interface | None) -> PolicyInfo:
 
 
 def load_policy(directory: str | Path) -> LoadedPolicy:
-    """The policy of a run directory, of `zoo:NAME` or of a `policy.npz` itself; needs NumPy only.
+    """The policy of a run directory, of `zoo:NAME`, of `hub:OWNER/NAME` on the Hugging Face hub (extra `hub`), or of a
+    `policy.npz` itself; needs NumPy only.
 
     Raises `RunDirectoryError` when there is none, or it is damaged, of another version or cannot act: other arrays than
     its sizes say, or weights that are not finite.

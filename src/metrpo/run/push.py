@@ -1,0 +1,103 @@
+"""A finished run's policy for the Hugging Face hub: what is sent, and the sending."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from metrpo.errors import MetrpoError, RunDirectoryError
+from metrpo.hub import asked, is_on_hub, library, repository
+from metrpo.run.card import model_card, task_name
+from metrpo.run.export import export
+from metrpo.run.find import SeenRun, is_finished, read
+from metrpo.run.policy_file import FILE
+from metrpo.zoo import is_in_zoo
+
+CARD = "model_card.md"
+"""In the run directory; on the hub it is README.md."""
+_NEEDED = (FILE, "policy.json", "config.json", "metrics.csv")
+# The hub shows a replay.mp4 on the model's page.
+_WHERE_THERE = {"curve.png": "curve.png", "video.mp4": "replay.mp4"}
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """What is sent: names on the hub, each with its content or the file that has it."""
+
+    repo: str
+    files: dict[str, bytes | Path]
+
+    @property
+    def card(self) -> str:
+        """The model card."""
+        content = self.files["README.md"]
+        assert isinstance(content, bytes)
+        return content.decode()
+
+
+def parcel(run_dir: Path, repo: str | None, owner: str = "OWNER") -> Parcel:
+    """What `push` sends of a run; without `repo`, to `owner`'s repository metrpo-TASK.
+
+    Raises `RunDirectoryError` unless it is the directory of a finished run, `MetrpoError` for an impossible `repo`.
+    """
+    run = _finished(run_dir)
+    repo = repository(repo or f"{owner}/{_default_name(run)}")
+    files: dict[str, bytes | Path] = {name: run_dir / name for name in _NEEDED}
+    files |= {there: run_dir / here for here, there in _WHERE_THERE.items() if (run_dir / here).is_file()}
+    with TemporaryDirectory() as folder:
+        files["policy.py"] = export(run_dir, Path(folder) / "policy.py").read_bytes()
+    files["README.md"] = model_card(run, repo, list(files)).encode()
+    return Parcel(repo, dict(sorted(files.items())))
+
+
+def owner_of_token() -> str:
+    """Who is logged in. Raises `MetrpoError` without the extra, when nobody is, or the hub cannot be reached."""
+    hub = library()
+    _require_token(hub)
+    with asked("expected the hub to say whose token this is"):
+        return str(hub.HfApi().whoami()["name"])
+
+
+def send(sent: Parcel, private: bool = False) -> str:
+    """Sends it as one commit, to a repository that is made where there is none; returns its address.
+
+    Raises `MetrpoError` without the extra or when nobody is logged in, `RunDirectoryError` when the hub refuses it or
+    cannot be reached.
+    """
+    hub = library()
+    _require_token(hub)
+    api = hub.HfApi()
+    operations = [hub.CommitOperationAdd(name, content) for name, content in sent.files.items()]
+    with asked(f"{sent.repo}: expected the hub to take it"):
+        address = api.create_repo(sent.repo, private=private or None, exist_ok=True)
+        api.create_commit(sent.repo, operations, commit_message="A policy that metrpo trained")
+    return str(address)
+
+
+def _require_token(hub: object) -> None:
+    if not hub.get_token():  # type: ignore[attr-defined]
+        raise MetrpoError(
+            "expected to be logged in to the Hugging Face hub, found no token; run: hf auth login, or set "
+            "HF_TOKEN to a token that may write"
+        )
+
+
+def _finished(run_dir: Path) -> SeenRun:
+    if is_in_zoo(run_dir) or is_on_hub(run_dir):
+        raise RunDirectoryError(f"{run_dir}: expected the directory of a run of yours, got a policy's name")
+    if missing := [name for name in _NEEDED if not (run_dir / name).is_file()]:
+        raise RunDirectoryError(f"{run_dir}: expected the directory of a finished run, got none with {missing[0]}")
+    run = read(run_dir)
+    if not is_finished(run):
+        raise RunDirectoryError(
+            f"{run_dir}: expected a finished run, got one of {len(run.rows)} iterations whose budget is not spent; go "
+            "on with the command that began it, or with a smaller budget"
+        )
+    return run
+
+
+def _default_name(run: SeenRun) -> str:
+    task = re.sub(r"\.py\b|[^A-Za-z0-9_.]+", "-", task_name(run.config.task))
+    return f"metrpo-{re.sub('-+', '-', task).strip('-.')[:80] or 'policy'}"
