@@ -34,7 +34,8 @@ PAPER: dict[str, Overrides] = {
 FAST_ALL: Overrides = {
     "advantage.baseline": "network",
     "advantage.gae_lambda": 0.95,
-    "collect.max_std": 1.0,
+    "collect.max_std": 3.0,
+    "collect.std_power": 3.0,
     "collect.parameter_noise": 1.0,
     "ensemble.hidden": (200, 200, 200),
     "ensemble.delta_std_floor": 1e-8,
@@ -50,7 +51,6 @@ FAST_ALL: Overrides = {
     "policy.mean_penalty": 1.0,
     "policy.min_std": 0.2,
     "policy.normalise": True,
-    "policy.restart_every": 3,
     "validate.max_updates": 100,
     "validate.real_episodes": 4,
     "validate.starts": 50,
@@ -75,6 +75,8 @@ FAST: dict[str, Overrides] = {
 
 LONG_HORIZON_ALL: Overrides = {
     "advantage.discount": 0.99,
+    "collect.max_std": 1.0,
+    "collect.std_power": 1.0,
     "collect.parameter_noise": 0.0,
     "collect.steps": 3000,
     "fit.max_steps": 1500,
@@ -83,7 +85,6 @@ LONG_HORIZON_ALL: Overrides = {
     "imagine.steps": 12_000,
     "iterations": 20,
     "policy.initial_std": 0.5,
-    "policy.restart_every": 0,
     "validate.max_updates": 40,
     "validate.starts": 100,
 }

@@ -114,6 +114,7 @@ IMPOSSIBLE = {
     "max_change": [0.0, -0.1, float("inf")],
     "collect.steps": [0],
     "collect.max_std": [-0.1, float("inf"), float("nan")],
+    "collect.std_power": [0.0, -1.0, float("inf"), float("nan")],
     "collect.parameter_noise": [-1.0, float("nan")],
     "collect.validation_fraction": [0.0, 1.0, -0.5, float("nan")],
     "collect.max_train": [0],

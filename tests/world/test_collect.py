@@ -66,10 +66,11 @@ def test_the_noise_is_added_to_the_mean():
     np.testing.assert_allclose(actions.mean(0), mean, atol=0.01)
 
 
-def test_one_std_per_episode_is_uniform():
-    episodes = collect(probe.LONG_PROBE, max_std=0.2, steps=200 * 150)
+@pytest.mark.parametrize("power", [1.0, 3.0])
+def test_one_std_per_episode_is_a_power_of_a_uniform_draw(power):
+    episodes = collect(probe.LONG_PROBE, max_std=0.2, std_power=power, steps=200 * 150)
     stds = [e.actions.std() for e in episodes]
-    assert stats.kstest(stds, stats.uniform(0, 0.2).cdf).pvalue > 1e-3
+    assert stats.kstest(stds, stats.powerlaw(1 / power, scale=0.2).cdf).pvalue > 1e-3
     # within an episode the noise is Gaussian: normalised, all of it is N(0, 1)
     z = np.concatenate([e.actions / s for e, s in zip(episodes, stds, strict=True)])
     assert stats.kurtosis(z.ravel()) == pytest.approx(0, abs=0.1)

@@ -20,7 +20,9 @@ class CollectConfig:
     steps: int = 3000
     """Real steps per outer iteration, at least: whole episodes are played until this many are reached."""
     max_std: float = 3.0
-    """Exploration noise: the standard deviation is drawn from U[0, max_std]."""
+    """Exploration noise: the standard deviation is max_std times a draw from U[0, 1] raised to std_power."""
+    std_power: float = 1.0
+    """1: any standard deviation is as likely (the paper). More: most are small, and now and then one is large."""
     std_per: Literal["episode", "step"] = "episode"
     """How often that standard deviation is drawn: once an episode (the paper) or at every step (authors' code)."""
     parameter_noise: float = 3.0
@@ -35,6 +37,7 @@ class CollectConfig:
     def __post_init__(self) -> None:
         require(self.steps >= 1, "collect.steps", self.steps, "at least 1")
         require(nonnegative(self.max_std), "collect.max_std", self.max_std, "a finite number >= 0")
+        require(positive(self.std_power), "collect.std_power", self.std_power, "a finite number > 0")
         require(
             nonnegative(self.parameter_noise), "collect.parameter_noise", self.parameter_noise, "a finite number >= 0"
         )

@@ -16,6 +16,7 @@ from metrpo.errors import ConfigError
 from metrpo.safe_load import brief, json_of
 
 ADDED = (
+    "config.collect.std_power",
     "config.fit.products",
     "config.policy.normalise",
     "config.policy.min_std",

@@ -134,14 +134,17 @@ def reset_states(task: Task, count: int, rng: np.random.Generator) -> np.ndarray
 
 
 def explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
-    """The paper's exploration (appendix A.1.1): `mean` plus std x N(0, I), std ~ U[0, max_std] per episode or step."""
+    """`mean` plus std x N(0, I), std = max_std x U[0, 1] ** std_power per episode or step (paper, appendix A.1.1: 1)."""
+
+    def draw() -> float:
+        return config.max_std * rng.uniform() ** config.std_power
 
     def stds() -> Iterator[float]:
-        std = rng.uniform(0.0, config.max_std)
+        std = draw()
         while True:
             yield std
             if config.std_per == "step":
-                std = rng.uniform(0.0, config.max_std)
+                std = draw()
 
     std = stds()
 
