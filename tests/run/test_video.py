@@ -223,3 +223,37 @@ def test_the_swimmer_is_seen(tmp_path):
     with Image.open(path) as picture:
         assert picture.n_frames == 4
         assert len(set(picture.convert("L").tobytes())) > 20
+
+
+@pytest.mark.parametrize(
+    ("own", "found", "seen"), [(None, "osmesa", "osmesa"), ("egl", "osmesa", "egl"), (None, None, None)]
+)
+def test_other_environments_draw_by_the_library_that_ours_would_take(own, found, seen, tmp_path, monkeypatch):
+    """Gymnasium would take GLFW, which fails where there is no display."""
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    if own:
+        monkeypatch.setenv("MUJOCO_GL", own)
+    monkeypatch.setattr(video, "gl_library", lambda: found)
+    asked = []
+
+    class Drawn(Pictures):
+        def render(self):
+            asked.append(os.environ.get("MUJOCO_GL"))
+            return super().render()
+
+    record(Drawn, zero, tmp_path / "video.gif")
+    assert set(asked) == {seen}
+    assert os.environ.get("MUJOCO_GL") == own
+
+
+def test_an_error_of_the_environment_passes_whatever_draws_it(tmp_path, monkeypatch):
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    monkeypatch.setattr(video, "gl_library", lambda: "osmesa")
+
+    class Broken(Pictures):
+        def step(self, action):
+            raise ValueError("a joint")
+
+    with pytest.raises(ValueError, match="a joint"):
+        record(Broken, zero, tmp_path / "video.gif")
+    assert "MUJOCO_GL" not in os.environ
