@@ -273,7 +273,7 @@ def test_the_previous_policy_precedes_the_last_changing_phase(tiny, monkeypatch,
         return (
             policy,
             np.zeros(8, np.float32),
-            policy_phase.PhaseInfo(values, values, 10, accepted, 0, 2, np.zeros(2), 0.0, 0.0),
+            policy_phase.PhaseInfo(values, 10, accepted, 0, 2, np.zeros(2), 0.0, 0.0),
         )
 
     monkeypatch.setattr(algorithm, "improve_policy", phase)

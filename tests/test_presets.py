@@ -107,7 +107,6 @@ OURS = {
     "policy.normalise": (False, "code: the policy sees the full, unnormalised state"),
     "policy.min_std": (0.0, "A.1.3: the std is reset at every phase (code)"),
     "policy.mean_penalty": (0.0, "the paper knows none: off"),
-    "policy.restart_every": (0, "the paper has one policy"),
     "validate.real_episodes": (0, "the paper validates in the models only"),
     "imagine.disagreement": (0.0, "the paper's future work: off"),
     "trust_reward": (False, "the paper's tasks are our own"),

@@ -247,7 +247,7 @@ def learn_at_once(monkeypatch):
         weights, bias = state.policy.layers[-1]
         seen = dataset.train.states.std() + (dataset.origin - [1e8, 1e8]).sum()
         layers = (*state.policy.layers[:-1], (weights, np.asarray(bias) + np.float32(seen)))
-        info = PhaseInfo(two, two, 5, 1, 0, 1, two, 0.0, 0.0)
+        info = PhaseInfo(two, 5, 1, 0, 1, two, 0.0, 0.0)
         return state.policy._replace(layers=layers), state.baseline, info
 
     def networks(config, task, key):

@@ -26,10 +26,8 @@ from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import ConfigError
 from metrpo.finite import require_finite
 from metrpo.policy import gaussian
-from metrpo.policy.gaussian import Policy
 from metrpo.policy.inputs import folded
 from metrpo.policy.value.table import init_baseline
-from metrpo.policy_phase import PhaseInfo
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.stages.ensemble_fit import fit_ensemble, fresh_networks
@@ -128,7 +126,7 @@ def learn(
         iteration=iteration,
         real_steps=state.real_steps + sum(len(e.rewards) for e in episodes),
         policy=policy,
-        previous_policy=_before(state, policy, improved),
+        previous_policy=state.policy if improved.accepted_updates else state.previous_policy,
         networks=ensemble.networks,
         baseline=baseline,
         dataset=dataset,
@@ -140,13 +138,6 @@ def learn(
         progress.stage("evaluate", config.evaluation_episodes)
         row = record(config, task, following, Done(episodes, real.failed, ensemble, fitted, improved, verdict))
     return following, row | clock.row()
-
-
-def _before(state: State, policy: Policy, improved: PhaseInfo) -> Policy:
-    """The policy from which the next parameter noise is measured: a fresh one has none."""
-    if improved.restarted:
-        return policy
-    return state.policy if improved.accepted_updates else state.previous_policy
 
 
 def _logged(config: Config, task: Task) -> Dataset:

@@ -37,8 +37,6 @@ class PhaseInfo(NamedTuple):
 
     values: Float[np.ndarray, "K"]
     """Each model's value of the accepted policy."""
-    first_values: Float[np.ndarray, "K"]
-    """Each model's value of the policy that the phase began with."""
     updates: int
     accepted_updates: int
     """Updates up to the accepted policy."""
@@ -51,8 +49,6 @@ class PhaseInfo(NamedTuple):
     """Mean over the updates."""
     diverged: float
     """Share of imagined rollouts, mean over the updates."""
-    restarted: bool = False
-    """Whether it began with a fresh policy, which the models prefer to the one that the run had."""
 
 
 class Starts(NamedTuple):
@@ -106,7 +102,6 @@ def improve(
     policy = policy if inputs is None else unfolded(policy, inputs)
     memory = init_memory(settings, policy, baseline)
     accepted, reference, kept = policy, evidence(policy, np.array([-np.inf])), memory.baseline
-    first_values = reference.values
     updates = accepted_at = 0
     infos: list[tuple[ImproveInfo, ImagineInfo]] = []
     agreed: list[np.ndarray] = []
@@ -136,7 +131,6 @@ def improve(
         kept,
         PhaseInfo(
             values=reference.values,
-            first_values=first_values,
             updates=updates,
             accepted_updates=accepted_at,
             rejected_steps=int(np.sum(~improve_info.accepted)),

@@ -13,7 +13,7 @@ from metrpo.types import Array
 class Stage(IntEnum):
     """What the randomness is for."""
 
-    INIT, COLLECT, FIT, IMPROVE, EVALUATE, SPLIT, RESET, DIAGNOSE, ORACLE, PROVE, RESTART = range(11)
+    INIT, COLLECT, FIT, IMPROVE, EVALUATE, SPLIT, RESET, DIAGNOSE, ORACLE, PROVE = range(10)
 
 
 def key_of(seed: int, iteration: int, stage: Stage) -> Array:

@@ -138,7 +138,6 @@ IMPOSSIBLE = {
     "policy.initial_std": [0.0, -1.0, float("nan")],
     "policy.min_std": [-0.1, float("inf"), float("nan")],
     "policy.mean_penalty": [-0.1, float("inf"), float("nan")],
-    "policy.restart_every": [-1],
     "validate.real_episodes": [-1, 1],
     "advantage.discount": [-0.1, 1.1, float("nan")],
     "advantage.gae_lambda": [-0.1, 1.1, float("nan")],

@@ -141,7 +141,7 @@ def _learn_nothing(monkeypatch):
         return Ensemble(networks, n), FitInfo(1, three, three, three, three > 1, three > 1)
 
     def improve(config, task, state, *_):
-        return state.policy, state.baseline, PhaseInfo(three, three, 5, 0, 0, 1, three, 0.0, 0.0)
+        return state.policy, state.baseline, PhaseInfo(three, 5, 0, 0, 1, three, 0.0, 0.0)
 
     def rollouts(ensemble, policy, starts, actions, key):
         length, count, size = actions.shape[1], *starts.shape

@@ -40,7 +40,6 @@ AS_IT_WAS = {
     "imagine.steps": 30_000,
     "policy.initial_std": 2.0,
     "policy.mean_penalty": 0.0,
-    "policy.restart_every": 0,
     "policy.min_std": 0.0,
     "policy.normalise": False,
     "trpo.max_kl": 0.03,

@@ -147,16 +147,12 @@ class PolicyConfig:
     mean_penalty: float = 0.0
     """Taken from the surrogate of trpo, ppo and vpg: this times the squared excess of mean actions beyond 0.9, over the
     standard deviation."""
-    restart_every: int = 0
-    """Every n-th iteration improves a fresh policy, too. It takes the place of the other where the models say that it
-    learned a fifth more: a way out of a local optimum. 0: never."""
 
     def __post_init__(self) -> None:
         require(all(n >= 1 for n in self.hidden), "policy.hidden", self.hidden, "sizes of at least 1")
         require(positive(self.initial_std), "policy.initial_std", self.initial_std, "a finite number > 0")
         require(nonnegative(self.min_std), "policy.min_std", self.min_std, "a finite number >= 0")
         require(nonnegative(self.mean_penalty), "policy.mean_penalty", self.mean_penalty, "a finite number >= 0")
-        require(self.restart_every >= 0, "policy.restart_every", self.restart_every, "at least 0")
 
 
 @dataclass(frozen=True)

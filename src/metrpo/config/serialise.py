@@ -21,7 +21,6 @@ ADDED = (
     "config.policy.normalise",
     "config.policy.min_std",
     "config.policy.mean_penalty",
-    "config.policy.restart_every",
     "config.imagine.horizon",
     "config.imagine.products",
     "config.imagine.disagreement",

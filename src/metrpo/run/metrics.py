@@ -41,7 +41,7 @@ def is_clock(column: str) -> bool:
 
 _LATER = re.compile(
     r"members_reset|failed_episodes|failed_evaluation|unfit_dimensions|(error|disagreement|improved)_\w+|outside|saturated"
-    r"|return_proof|given_up|restarted"
+    r"|return_proof|given_up"
 )
 """Columns that runs begun with an earlier version do not have."""
 _DETAIL = re.compile(r"error_\w+_\d+|improved_\d+")

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from copy import deepcopy
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -16,9 +14,7 @@ from metrpo.finite import naming
 from metrpo.model.ensemble import Ensemble
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
-from metrpo.policy.inputs import folded
-from metrpo.policy.stopping import most_improve
-from metrpo.policy.value.table import Baseline, init_baseline
+from metrpo.policy.value.table import Baseline
 from metrpo.policy_phase import Hooks, PhaseInfo, Starts, simulator_of
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of, rng_of
@@ -29,21 +25,17 @@ from metrpo.world.dataset import Dataset
 from metrpo.world.origin import relative, shifted
 from metrpo.world.task import Task
 
-CLEARLY = 1.2
-
 
 def improve_policy(
     config: Config, task: Task, state: State, ensemble: Ensemble, progress: Progress, clock: Clock
 ) -> tuple[Policy, Baseline, PhaseInfo]:
     """The policy phase (`metrpo.policy_phase`): the accepted policy, its baseline and what happened.
 
-    `state` holds the dataset that the ensemble was fitted to. Where it is an iteration for that, a fresh policy has a
-    phase as well, and the models vote between the two.
+    `state` holds the dataset that the ensemble was fitted to.
     """
     iteration, dataset = state.iteration + 1, state.dataset
     rng = rng_of(config.seed, iteration, Stage.IMPROVE)
-    inputs = inputs_for(config, task, dataset)
-    simulator = simulator_of(config, shifted(task, dataset.origin), ensemble, inputs)
+    simulator = simulator_of(config, shifted(task, dataset.origin), ensemble, inputs_for(config, task, dataset))
     starts = _starts(config, task, dataset, iteration, simulator.horizon, rng)
 
     def oracle(policy: Policy) -> float:
@@ -54,36 +46,15 @@ def improve_policy(
     def tell(updates: int, accepted: int, value: float) -> None:
         progress.update(updates, f"accepted {accepted}, imagined return {value:.2f}")
 
-    def phase(policy: Policy, baseline: Baseline, stage: Stage) -> tuple[Policy, Baseline, PhaseInfo]:
-        # Every phase draws the same start states, so that the models can compare what they end with.
-        began, key = Starts(starts, deepcopy(rng)), key_of(config.seed, iteration, stage)
-        return policy_phase.improve(config, simulator, policy, baseline, began, key, Hooks(clock, tell, oracle))
-
-    found = phase(_with_std(config, state), state.baseline, Stage.IMPROVE)
-    if not config.policy.restart_every or iteration % config.policy.restart_every:
-        return found
-    progress.stage("improve a fresh policy", config.validate.max_updates)
-    policy, baseline = fresh_policy(config, task, iteration, Stage.RESTART)
-    other = phase(policy if inputs is None else folded(policy, inputs), baseline, Stage.RESTART)
-    return (*other[:2], other[2]._replace(restarted=True)) if _is_preferred(config, other[2], found[2]) else found
-
-
-def _is_preferred(config: Config, fresh: PhaseInfo, other: PhaseInfo) -> bool:
-    """Whether the models vote for the policy of the `fresh` phase: it learned `CLEARLY` times what the other knows.
-
-    Both gains are measured from the policy that knows nothing: neither the size nor the origin of rewards matters.
-    A little more is no reason: a policy that is new to the data is promised too much.
-    """
-    nothing = fresh.first_values
-    return most_improve(fresh.values - nothing, CLEARLY * (other.values - nothing), config.validate)
-
-
-def fresh_policy(config: Config, task: Task, iteration: int, stage: Stage) -> tuple[Policy, Baseline]:
-    """A policy that has learned nothing, and its value function."""
-    key = key_of(config.seed, iteration, stage)
-    p = config.policy
-    policy = gaussian.init(key, task.state_size, task.action_size, p.hidden, p.initial_std)
-    return policy, init_baseline(config.advantage, task.state_size, jax.random.fold_in(key, 0))
+    return policy_phase.improve(
+        config,
+        simulator,
+        _with_std(config, state),
+        state.baseline,
+        Starts(starts, rng),
+        key_of(config.seed, iteration, Stage.IMPROVE),
+        Hooks(clock, tell, oracle),
+    )
 
 
 def _starts(

@@ -148,8 +148,6 @@ def record(config: Config, task: Task, state: State, done: Done) -> Row:
     row = _outcome(state, returns, done, cut=imagined_horizon(config, task) < task.horizon or task.horizon > RECORDED)
     if config.validate.real_episodes:
         row |= {"return_proof": done.verdict.mean, "given_up": int(done.verdict.given_up)}
-    if config.policy.restart_every:
-        row |= {"restarted": int(done.improved.restarted)}
     row |= {"failed_episodes": done.failed, "failed_evaluation": failed_evaluation(task, returns)}
     row |= {"unfit_dimensions": recorded("unfit_dimensions", iteration, unfit, math.nan)}
     shares = {f"improved_{k}": float(share) for k, share in enumerate(done.improved.improved)}

@@ -134,7 +134,10 @@ def reset_states(task: Task, count: int, rng: np.random.Generator) -> np.ndarray
 
 
 def explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
-    """`mean` plus std x N(0, I), std = max_std x U[0, 1] ** std_power per episode or step (paper, appendix A.1.1: 1)."""
+    """`mean` plus std x N(0, I), std = max_std x U[0, 1] ** std_power per episode or step.
+
+    The paper (appendix A.1.1) has the power 1.
+    """
 
     def draw() -> float:
         return config.max_std * rng.uniform() ** config.std_power
