@@ -255,7 +255,7 @@ def test_fitting_stops_when_no_member_improves_within_patience(monkeypatch, impr
     def tell(passes, losses):
         told.append((passes, np.array(losses)))
 
-    _, info = fit(*ensemble, train, validation, config, KEY, tell)
+    _, info = fit(*ensemble[:2], train, validation, config, KEY, tell)
     assert info.passes == passes
     every = config.validate_every
     # 3,500 rows are 3 minibatches of 1,000: a pass is 3 steps, whatever the capacity.
@@ -279,8 +279,8 @@ def test_capacity_beyond_the_size_has_no_influence():
             *(np.pad(x, ((0, capacity - len(x)), (0, 0)), constant_values=garbage) for x in t[:3]), t.size
         )
 
-    exact = fit(*ensemble, train, validation, SHORT, KEY)
-    roomy = fit(*ensemble, padded(train, 100), padded(validation, 1500), SHORT, KEY)
+    exact = fit(*ensemble[:2], train, validation, SHORT, KEY)
+    roomy = fit(*ensemble[:2], padded(train, 100), padded(validation, 1500), SHORT, KEY)
     for ours, theirs in zip(jax.tree.leaves(roomy), jax.tree.leaves(exact), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-6)
 
@@ -290,7 +290,7 @@ def test_the_callers_arrays_stay_usable():
     ensemble = random_ensemble(1)._replace(normaliser=ensembles.normaliser_of(train, 0.1, 0.1))
     given = jax.tree.map(jnp.asarray, (ensemble, train, validation))
     before = jax.tree.map(np.array, given)
-    fit(*given[0], given[1], given[2], SHORT, KEY)
+    fit(*given[0][:2], given[1], given[2], SHORT, KEY)
     assert not any(x.is_deleted() for x in jax.tree.leaves(given))
     assert jax.tree.all(jax.tree.map(np.array_equal, given, before))
 
