@@ -671,13 +671,13 @@ def test_the_whole_loop_finds_the_optimum_of_the_probe():
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_swimmer_learns_to_swim():
-    """Four iterations of the fast preset; an untrained swimmer earns about 0, seeds 0, 1 and 2 earned 35, 34 and 23."""
+    """Five iterations of the fast preset; an untrained swimmer earns about 0, seeds 0 and 10 earned 32 and 33."""
     returns = []
 
     class Returns(Progress):
         def end(self, row, seconds_left=None):
             returns.append(row["return_real"])
 
-    training.train(preset("Swimmer", iterations=4), progress=Returns())
-    assert len(returns) == 4
+    training.train(preset("Swimmer", iterations=5), progress=Returns())
+    assert len(returns) == 5
     assert max(returns[-2:]) > 15
