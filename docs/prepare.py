@@ -184,6 +184,7 @@ def settings() -> str:
     A preset's cell is empty where it has the default. What presets set for single tasks stands in a last table.
     """
     from metrpo import config, presets
+    from metrpo.report.tables import markdown
 
     chosen = {"fast": presets.FAST_ALL, "long-horizon": presets.FAST_ALL | presets.LONG_HORIZON_ALL}
     groups = [field for field in dataclasses.fields(config.Config) if field.default_factory is not dataclasses.MISSING]
@@ -195,11 +196,13 @@ def settings() -> str:
         for name, table in own
         for task, row in table.items()
     ]
-    tables.append("## Single tasks\n\n" + _table(("task", "preset", "has"), rows))
+    tables.append("## Single tasks\n\n" + markdown(("task", "preset", "has"), rows))
     return "\n".join(tables)
 
 
 def _settings_table(title: str, prefix: str, group: type, presets: dict[str, dict[str, object]]) -> str:
+    from metrpo.report.tables import markdown
+
     rows, texts = [], _field_texts(group)
     for field in dataclasses.fields(group):
         if field.default_factory is dataclasses.MISSING:
@@ -208,12 +211,7 @@ def _settings_table(title: str, prefix: str, group: type, presets: dict[str, dic
             values = [preset.get(name, default) for preset in presets.values()]
             cells = ("" if value == default else _shown(value) for value in values)
             rows.append((f"`{name}`", shown, *cells, texts[field.name]))
-    return f"## {title}\n\n{group.__doc__}\n\n" + _table(("setting", "default", *presets, "what it is"), rows)
-
-
-def _table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    lines = (head, ["---"] * len(head), *rows)
-    return "".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |\n" for line in lines)
+    return f"## {title}\n\n{group.__doc__}\n\n" + markdown(("setting", "default", *presets, "what it is"), rows)
 
 
 def _shown(value: object) -> str:

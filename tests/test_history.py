@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import subprocess
 import sys
 from functools import partial
@@ -16,6 +15,7 @@ from hypothesis import strategies as st
 
 import late
 import probe
+from exported import act_and_reset, module_of
 from helpers import random_policy
 from metrpo import evaluate, evaluation, external, training
 from metrpo.commands import main
@@ -334,15 +334,6 @@ def a_policy(directory, limits=(1.0, None), origin=None):
     return directory
 
 
-def module_of(path):
-    sys.path.insert(0, str(path.parent))
-    try:
-        return importlib.import_module(path.stem)
-    finally:
-        sys.path.remove(str(path.parent))
-        del sys.modules[path.stem]
-
-
 ORIGIN = tied(np.array([1e8, 0.0]), LAYOUT.carried)
 
 
@@ -372,11 +363,7 @@ def test_every_form_sees_the_same_states(ending, origin, limits, tmp_path):
         said = session.get_inputs()[0]
         assert said.name == "state"
         return
-    act, reset = (
-        (lambda p: (p, p.reset))(load_policy(path))
-        if ending == ".npz"
-        else (lambda m: (m.act, m.reset))(module_of(path))
-    )
+    act, reset = act_and_reset(path)
     for _ in range(2):
         np.testing.assert_allclose([act(o) for o in observations], expected, atol=1e-5)
         reset()

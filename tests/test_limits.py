@@ -2,7 +2,6 @@
 
 import dataclasses
 import importlib
-import sys
 from functools import partial
 
 import jax
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 import probe
+from exported import act_and_reset
 from helpers import linear_ensemble, random_policy
 from metrpo import evaluate, training
 from metrpo.config import Config
@@ -92,15 +92,6 @@ def a_run(directory, limits=BOTH, task="Probe", policy=LOUD):
     save_policy(directory, policy, task, 1, 20, None, settings=settings)
 
 
-def module_of(path):
-    sys.path.insert(0, str(path.parent))
-    try:
-        return importlib.import_module(path.stem)
-    finally:
-        sys.path.remove(str(path.parent))
-        del sys.modules[path.stem]
-
-
 @pytest.mark.parametrize("ending", [".npz", ".py", ".onnx"])
 def test_every_form_keeps_them_and_forgets_at_reset(ending, tmp_path):
     a_run(tmp_path)
@@ -120,11 +111,7 @@ def test_every_form_keeps_them_and_forgets_at_reset(ending, tmp_path):
             found.append(last[0])
         np.testing.assert_allclose(found, expected, atol=1e-5)
         return
-    act, reset = (
-        (lambda p: (p, p.reset))(load_policy(path))
-        if ending == ".npz"
-        else (lambda m: (m.act, m.reset))(module_of(path))
-    )
+    act, reset = act_and_reset(path)
     for _ in range(2):
         np.testing.assert_allclose([act(o) for o in observations], expected, atol=1e-5)
         reset()

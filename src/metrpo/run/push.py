@@ -8,12 +8,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from metrpo.errors import MetrpoError, RunDirectoryError
-from metrpo.hub import asked, is_on_hub, library, repository
+from metrpo.hub import asked, library, repository
 from metrpo.run.card import model_card, task_name
 from metrpo.run.export import export
 from metrpo.run.find import SeenRun, is_finished, read
 from metrpo.run.policy_file import FILE
-from metrpo.zoo import is_in_zoo
+from metrpo.zoo import is_name
 
 CARD = "model_card.md"
 """In the run directory; on the hub it is README.md."""
@@ -85,7 +85,7 @@ def _require_token(hub: object) -> None:
 
 
 def _finished(run_dir: Path) -> SeenRun:
-    if is_in_zoo(run_dir) or is_on_hub(run_dir):
+    if is_name(run_dir):
         raise RunDirectoryError(f"{run_dir}: expected the directory of a run of yours, got a policy's name")
     if missing := [name for name in _NEEDED if not (run_dir / name).is_file()]:
         raise RunDirectoryError(f"{run_dir}: expected the directory of a finished run, got none with {missing[0]}")
