@@ -32,7 +32,7 @@ from metrpo.run.episodes import EpisodeLog, append_episode
 from metrpo.run.export import export
 from metrpo.run.files import read_arrays, write_arrays
 from metrpo.run.metrics import read_metrics
-from metrpo.run.policy_file import load_policy, save_policy
+from metrpo.run.policy_file import Learned, load_policy, save_policy
 from metrpo.training import train
 from metrpo.world import collect, dataset, offline_data, registry
 from metrpo.world.history_env import with_history
@@ -330,7 +330,7 @@ def test_the_most_that_a_state_may_hold():
 
 def a_policy(directory, limits=(1.0, None), origin=None):
     settings = Config("Late", history=3, max_action=limits[0], max_change=limits[1])
-    save_policy(directory, POLICY, "Late", 1, 20, None, origin=origin, settings=settings)
+    save_policy(directory, POLICY, "Late", Learned(1, 20, None), origin=origin, settings=settings)
     return directory
 
 

@@ -20,7 +20,7 @@ from metrpo.policy import gaussian
 from metrpo.presets import override, preset
 from metrpo.run.export import export
 from metrpo.run.files import read_arrays, write_arrays
-from metrpo.run.policy_file import load_policy, save_policy
+from metrpo.run.policy_file import Learned, load_policy, save_policy
 from metrpo.world import batch_episodes, collect
 from metrpo.world.registry import get_task, limited, task_for
 from places import ROOT
@@ -89,7 +89,7 @@ def test_methods_that_cannot_keep_them_refuse(method, name):
 
 def a_run(directory, limits=BOTH, task="Probe", policy=LOUD):
     settings = Config(task, max_action=limits.max_action, max_change=limits.max_change)
-    save_policy(directory, policy, task, 1, 20, None, settings=settings)
+    save_policy(directory, policy, task, Learned(1, 20, None), settings=settings)
 
 
 @pytest.mark.parametrize("ending", [".npz", ".py", ".onnx"])
@@ -171,7 +171,7 @@ def test_the_robots_loop_counts_the_deadlines_it_misses(tmp_path, monkeypatch):
     fixed_rate, robot = importlib.import_module("fixed_rate"), importlib.import_module("robot")
     shows = importlib.import_module("arm").shows
     settings = Config("arm", max_action=0.6, max_change=0.25)
-    save_policy(tmp_path, random_policy(0, 3, 1, scale=9.0), "arm", 0, 0, None, shows, settings=settings)
+    save_policy(tmp_path, random_policy(0, 3, 1, scale=9.0), "arm", Learned(0, 0, None), shows, settings=settings)
     policy, arm, now, moved = load_policy(tmp_path), robot.Arm(np.random.default_rng(0)), [100.0], []
 
     def move(torque):

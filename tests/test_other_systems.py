@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 from helpers import random_policy
-from metrpo.run.policy_file import save_policy
+from metrpo.run.policy_file import Learned, save_policy
 
 HIDDEN = """
 import os, sys
@@ -32,7 +32,7 @@ print("all")
 
 
 def test_a_policy_is_used_where_there_is_no_unix(tmp_path):
-    save_policy(tmp_path / "run", random_policy(0, 3, 1), "Pendulum-v1", 1, 200, 1.5)
+    save_policy(tmp_path / "run", random_policy(0, 3, 1), "Pendulum-v1", Learned(1, 200, 1.5))
     code = [sys.executable, "-c", HIDDEN + USED]
     ran = subprocess.run(code, cwd=tmp_path, capture_output=True, text=True)
     assert (ran.returncode, ran.stdout.splitlines()[-1]) == (0, "all"), ran.stderr

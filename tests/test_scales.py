@@ -28,7 +28,7 @@ from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.export import export
 from metrpo.run.files import read_arrays, write_arrays
-from metrpo.run.policy_file import load_policy, save_policy
+from metrpo.run.policy_file import Learned, load_policy, save_policy
 from metrpo.stages import records
 from metrpo.types import Episode
 from metrpo.world import dataset as datasets
@@ -161,8 +161,8 @@ def test_formulas_get_real_states_in_float64():
 def test_a_stored_and_an_exported_policy_count_from_the_origin(tmp_path):
     policy, rng = random_policy(0, 2, 1), np.random.default_rng(0)
     near = rng.standard_normal((20, 2))
-    save_policy(tmp_path / "near", policy, "Seen", 1, 20, None)
-    save_policy(tmp_path / "far", policy, "Seen", 1, 20, None, origin=FAR)
+    save_policy(tmp_path / "near", policy, "Seen", Learned(1, 20, None))
+    save_policy(tmp_path / "far", policy, "Seen", Learned(1, 20, None), origin=FAR)
     expected = load_policy(tmp_path / "near")(near)
     assert np.ptp(expected) > 0.1, "actions that do not differ could not tell"
     loaded = load_policy(tmp_path / "far")
@@ -180,7 +180,7 @@ def test_a_stored_and_an_exported_policy_count_from_the_origin(tmp_path):
 def test_an_onnx_policy_takes_float64_where_there_is_an_origin(tmp_path):
     runtime = pytest.importorskip("onnxruntime")
     pytest.importorskip("onnx")
-    save_policy(tmp_path, random_policy(0, 2, 1), "Seen", 1, 20, None, origin=FAR)
+    save_policy(tmp_path, random_policy(0, 2, 1), "Seen", Learned(1, 20, None), origin=FAR)
     far = np.random.default_rng(0).standard_normal((20, 2)) + FAR
     session = runtime.InferenceSession(str(export(tmp_path, tmp_path / "p.onnx")), providers=["CPUExecutionProvider"])
     found = session.run(["action"], {"observation": far})[0]
@@ -188,14 +188,14 @@ def test_an_onnx_policy_takes_float64_where_there_is_an_origin(tmp_path):
 
 
 def test_a_policy_without_an_origin_is_stored_as_ever(tmp_path):
-    save_policy(tmp_path, random_policy(0, 2, 1), "Seen", 1, 20, None, origin=np.zeros(2))
+    save_policy(tmp_path, random_policy(0, 2, 1), "Seen", Learned(1, 20, None), origin=np.zeros(2))
     assert "origin" not in read_arrays(tmp_path / "policy.npz")[0]
     assert "_ORIGIN" not in export(tmp_path).read_text()
 
 
 @pytest.mark.parametrize("origin", [np.zeros(3), np.float32([1, 2]), np.array([np.inf, 0])])
 def test_an_origin_that_does_not_fit_is_refused(tmp_path, origin):
-    save_policy(tmp_path, random_policy(0, 2, 1), "Seen", 1, 20, None)
+    save_policy(tmp_path, random_policy(0, 2, 1), "Seen", Learned(1, 20, None))
     arrays, meta = read_arrays(tmp_path / "policy.npz")
     write_arrays(tmp_path / "policy.npz", arrays | {"origin": origin}, meta)
     with pytest.raises(RunDirectoryError, match=r"origin|finite weights"):

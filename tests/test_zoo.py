@@ -12,7 +12,7 @@ from metrpo import zoo
 from metrpo.commands import main
 from metrpo.config import Config
 from metrpo.errors import RunDirectoryError
-from metrpo.run.policy_file import save_policy
+from metrpo.run.policy_file import Learned, save_policy
 from metrpo.world.registry import get_task
 from places import ROOT
 from seen_runs import a_run
@@ -81,7 +81,9 @@ def test_the_best_run_that_shows_skill_is_chosen(tmp_path, monkeypatch):
         rows = [{"iteration": i, "real_steps": 100 * i, "return_real": value} for i, value in enumerate(returns, 1)]
         folder = a_run(tmp_path / "runs" / name, config, rows)
         sizes = get_task(config.task).state_size, get_task(config.task).action_size
-        save_policy(folder, random_policy(0, *sizes), config.task, len(returns), 100 * len(returns), returns[-1])
+        save_policy(
+            folder, random_policy(0, *sizes), config.task, Learned(len(returns), 100 * len(returns), returns[-1])
+        )
         (folder / "run.json").write_text('{"commit": "abc", "created": "2026-01-02T03:04"}')
 
     left("a", Config("Swimmer", seed=0), [1.0, 3.0])

@@ -25,7 +25,7 @@ from metrpo.presets import override
 from metrpo.run import directory
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.curve import draw_curve
-from metrpo.run.policy_file import load_policy, save_policy
+from metrpo.run.policy_file import Learned, load_policy, save_policy
 from metrpo.seeds import Stage
 from metrpo.stages.records import evaluate
 
@@ -159,7 +159,7 @@ def test_the_exported_policy_acts_as_stable_baselines3_predicts(runs, method, tm
     expected, _ = stable_baselines._model(config, env, 0, state).predict(states, deterministic=True)
     env.close()
     np.testing.assert_allclose(np.clip(gaussian.mean(state.policy, states), -1, 1), expected, atol=1e-5)
-    save_policy(tmp_path, state.policy, "Probe", 3, state.real_steps, None)
+    save_policy(tmp_path, state.policy, "Probe", Learned(3, state.real_steps, None))
     np.testing.assert_allclose(load_policy(tmp_path)(states), expected, atol=1e-5)
     assert np.ptp(expected) > 0.02, "the policy must not be the same everywhere"
     assert [len(b) for _, b in state.policy.layers] == {"ppo": [8, 6, 2], "ddpg": [8, 6, 2, 2]}[method]

@@ -42,7 +42,7 @@ from metrpo.run.episodes import EpisodeLog
 from metrpo.run.export import export
 from metrpo.run.files import read_arrays, write_arrays
 from metrpo.run.metrics import read_metrics, to_csv
-from metrpo.run.policy_file import LoadedPolicy, load_policy, save_policy
+from metrpo.run.policy_file import Learned, LoadedPolicy, load_policy, save_policy
 from metrpo.world import offline_data
 
 CONFIG = override(
@@ -136,7 +136,7 @@ def sound(tmp_path_factory):
             run.load(_load_checkpoint.template)
             run.begin(_load_checkpoint.template)
             run.episodes.append(random_episode(np.random.default_rng(0), 5, 2, 2))
-    save_policy(place, random_policy(0, 2, 2, (4,)), "Probe", 3, 60, -1.5)
+    save_policy(place, random_policy(0, 2, 2, (4,)), "Probe", Learned(3, 60, -1.5))
     rng = np.random.default_rng(0)
     states, actions = rng.normal(size=(7, 2)), rng.uniform(-1, 1, size=(6, 2))
     arrays = {"states": states[:-1], "next_states": states[1:], "actions": actions, "rewards": np.arange(6.0)}

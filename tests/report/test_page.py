@@ -15,7 +15,7 @@ from metrpo.config import ImagineConfig
 from metrpo.console.live_table import standing
 from metrpo.errors import RunDirectoryError
 from metrpo.report import page as pages
-from metrpo.report.charts import Line, bars, chart, number, real_frame
+from metrpo.report.charts import Axes, Line, bars, chart, number, real_frame
 from metrpo.report.page import page, record
 from metrpo.run.curve import draw_curve
 from metrpo.run.find import FoundRuns, SeenRun, find, group
@@ -314,15 +314,19 @@ def test_a_chart_puts_points_where_they_belong():
     import numpy as np
 
     x, y = np.array([0.0, 50.0, 100.0]), np.array([0.0, 10.0, np.nan])
-    drawn = chart("t", [Line(x, y, "a", "c0")], "x", "", size=(380, 230), frame=(0, 10))
+    drawn = chart("t", [Line(x, y, "a", "c0")], "x", "", size=(380, 230), axes=Axes(frame=(0, 10)))
     assert numbers_in(drawn, "cx") == [46.0, 208.0]
     low, high = numbers_in(drawn, "cy")
     assert low > high, "y goes up"
-    beyond = chart("t", [Line(x, np.array([1.0, 500.0, 2.0]), "a", "c0")], "x", "", frame=(0, 10))
+    beyond = chart("t", [Line(x, np.array([1.0, 500.0, 2.0]), "a", "c0")], "x", "", axes=Axes(frame=(0, 10)))
     assert ">500<" in beyond
     assert len(numbers_in(beyond, "cx")) == 2
     many = chart(
-        "t", [Line(np.arange(9.0), np.array([500.0] * 2 + [1.0] * 6 + [700.0]), "a", "c0")], "", "", frame=(0, 9)
+        "t",
+        [Line(np.arange(9.0), np.array([500.0] * 2 + [1.0] * 6 + [700.0]), "a", "c0")],
+        "",
+        "",
+        axes=Axes(frame=(0, 9)),
     )
     assert (many.count(">500<"), many.count(">700<")) == (1, 1), "values of neighbours do not lie on each other"
     stacked = bars("t", ["a", "b"], np.array([[1.0, 2.0], [3.0, 0.0]]), [1, 2], "x", "")

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from metrpo.report.charts import Line, chart
+from metrpo.report.charts import Axes, Line, chart
 from metrpo.report.heatmap import heat
 from metrpo.report.page import page
 from metrpo.report.trust import trust_of
@@ -72,7 +72,7 @@ def test_errors_of_all_horizons_share_one_logarithmic_axis(tmp_path):
 
 def test_a_logarithmic_axis_puts_tenfold_steps_equally_far_apart():
     y = np.array([0.1, 1.0, 10.0, 0.0, -1.0, np.nan])
-    made = chart("t", [Line(np.arange(6.0), y, "a", "c0")], "x", "", log_y=True, mark=1.0)
+    made = chart("t", [Line(np.arange(6.0), y, "a", "c0")], "x", "", axes=Axes(log_y=True, mark=1.0))
     low, middle, high = numbers_in(made, "cy")
     assert low - middle == pytest.approx(middle - high, abs=0.15)
     assert low > high
@@ -84,7 +84,7 @@ def test_a_logarithmic_axis_puts_tenfold_steps_equally_far_apart():
 
 @pytest.mark.parametrize("y", [[1e-300, 1e300], [1e300, 1e300], [1e-300, 1e-300], [0.5, 0.52], [-1.0, 0.0], [3.0, 3.0]])
 def test_no_range_is_too_odd_for_a_logarithmic_axis(y):
-    made = chart("t", [Line(np.array([0.0, 1.0]), np.array(y), "a", "c0")], "x", "", log_y=True)
+    made = chart("t", [Line(np.array([0.0, 1.0]), np.array(y), "a", "c0")], "x", "", axes=Axes(log_y=True))
     heights = [float(v) for v in re.findall(r'class="grid" [^>]*y1="([-\d.]+)"', made)]
     assert 2 <= len(heights) <= 10
     assert all(0 <= v <= 230 for v in heights)

@@ -14,7 +14,7 @@ from helpers import random_episode, random_policy
 from metrpo.errors import RunDirectoryError, TaskError
 from metrpo.run.episodes import EpisodeLog, append_episode
 from metrpo.run.files import DamagedFile
-from metrpo.run.policy_file import save_policy
+from metrpo.run.policy_file import Learned, save_policy
 
 
 def episodes(count, seed=0):
@@ -36,7 +36,7 @@ def names(run_dir):
 @pytest.fixture
 def run_dir(tmp_path):
     """A directory with a policy for states [4] and actions [2]."""
-    save_policy(tmp_path, random_policy(), "Somewhere", 0, 0, None)
+    save_policy(tmp_path, random_policy(), "Somewhere", Learned(0, 0, None))
     return tmp_path
 
 

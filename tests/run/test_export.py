@@ -24,7 +24,7 @@ from metrpo.errors import MetrpoError, RunDirectoryError
 from metrpo.policy import gaussian
 from metrpo.run.export import export
 from metrpo.run.files import read_arrays, write_arrays
-from metrpo.run.policy_file import PolicyInfo, load_policy, save_policy
+from metrpo.run.policy_file import Learned, PolicyInfo, load_policy, save_policy
 from metrpo.world.interface import Interface
 from metrpo.world.registry import get_task
 
@@ -47,7 +47,7 @@ HOSTILE = [
 def saved(directory, hidden=(8,), scale=1.0, task="Swimmer", interface=None):
     policy = gaussian.init(jax.random.key(1), S, A, hidden, 1.0)
     policy = policy._replace(layers=tuple((scale * w, b + 0.1) for w, b in policy.layers))
-    save_policy(directory, policy, task, 3, 900, 12.5, interface)
+    save_policy(directory, policy, task, Learned(3, 900, 12.5), interface)
     return policy
 
 
@@ -178,9 +178,11 @@ def test_a_policy_of_old_acts_and_says_that_it_knows_no_range(ending, ordinary, 
 
 
 def test_a_known_tasks_old_policy_is_exported_with_its_range(tmp_path):
-    save_policy(tmp_path, random_policy(0, 3, 1), "Pendulum-v1", 1, 1000, 1.0)  # without its interface, as before
+    save_policy(
+        tmp_path, random_policy(0, 3, 1), "Pendulum-v1", Learned(1, 1000, 1.0)
+    )  # without its interface, as before
     assert python(export(tmp_path)).control(np.zeros(3)).shape == (1,)
-    save_policy(tmp_path, random_policy(0, 3, 1), f"{tmp_path}/evil.py:make", 1, 1000, 1.0)
+    save_policy(tmp_path, random_policy(0, 3, 1), f"{tmp_path}/evil.py:make", Learned(1, 1000, 1.0))
     (tmp_path / "evil.py").write_text("raise SystemExit(9)")
     assert python(export(tmp_path)).ACTION_LOW is None
 
@@ -189,7 +191,7 @@ def test_a_walkers_exported_policy_plays_the_plain_environment(tmp_path):
     """From what its file says alone: which number to put in front, and in which units to act."""
     task = get_task("HalfCheetah-v5")
     policy = random_policy(0, 18, 6)
-    save_policy(tmp_path, policy, task.name, 1, 1000, 1.0, task.interface)
+    save_policy(tmp_path, policy, task.name, Learned(1, 1000, 1.0), task.interface)
     module = python(export(tmp_path))
     assert [size for size, _ in module.OBSERVATION] == [1, 17]
     assert "global x, added by metrpo" in module.__doc__
@@ -206,7 +208,7 @@ def test_a_walkers_exported_policy_plays_the_plain_environment(tmp_path):
 
 def test_the_pendulums_torque_is_that_of_the_environment(tmp_path):
     task = get_task("Pendulum-v1")
-    save_policy(tmp_path, random_policy(0, 3, 1), task.name, 1, 1000, 1.0, task.interface)
+    save_policy(tmp_path, random_policy(0, 3, 1), task.name, Learned(1, 1000, 1.0), task.interface)
     module = python(export(tmp_path))
     assert (module.ACTION_LOW, module.ACTION_HIGH) == ([-2.0], [2.0])
     assert module.OBSERVATION == [[3, "the observation of Pendulum-v1"]]

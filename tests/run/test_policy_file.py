@@ -15,7 +15,7 @@ from metrpo.errors import RunDirectoryError
 from metrpo.policy import gaussian
 from metrpo.run.directory import stored_config
 from metrpo.run.files import read_arrays, write_arrays
-from metrpo.run.policy_file import load_policy, save_policy
+from metrpo.run.policy_file import Learned, load_policy, save_policy
 from metrpo.world.interface import Interface
 
 S, A, HIDDEN = 5, 2, (8, 6)
@@ -28,7 +28,7 @@ def policy():
 
 @pytest.fixture
 def loaded(policy, tmp_path):
-    save_policy(tmp_path, policy, "Swimmer", 3, 900, 12.5)
+    save_policy(tmp_path, policy, "Swimmer", Learned(3, 900, 12.5))
     return load_policy(tmp_path)
 
 
@@ -44,7 +44,7 @@ def test_it_is_the_clipped_mean_of_the_trained_policy(policy, loaded, shape, dty
 
 def test_actions_are_clipped_and_repeatable(policy, tmp_path):
     loud = policy._replace(layers=jax.tree.map(lambda w: 50 * w, policy.layers))
-    save_policy(tmp_path, loud, "Swimmer", 1, 1, None)
+    save_policy(tmp_path, loud, "Swimmer", Learned(1, 1, None))
     observations = np.random.default_rng(0).standard_normal((50, S))
     actions = load_policy(tmp_path)(observations)
     assert np.abs(actions).max() == 1
@@ -53,13 +53,13 @@ def test_actions_are_clipped_and_repeatable(policy, tmp_path):
 
 def test_an_interface_of_other_sizes_is_left_out(policy, tmp_path):
     fitting = Interface(((S, "all"),), (-1.0,) * A, (2.0,) * A)
-    save_policy(tmp_path, policy, "Swimmer", 3, 900, 12.5, fitting)
+    save_policy(tmp_path, policy, "Swimmer", Learned(3, 900, 12.5), fitting)
     assert load_policy(tmp_path).info.action_high == (2.0,) * A
     for other in (
         dataclasses.replace(fitting, observation=((S - 1, "x"),)),
         dataclasses.replace(fitting, action_low=()),
     ):
-        save_policy(tmp_path, policy, "Swimmer", 3, 900, 12.5, other)
+        save_policy(tmp_path, policy, "Swimmer", Learned(3, 900, 12.5), other)
         assert load_policy(tmp_path).info.action_high is None
 
 

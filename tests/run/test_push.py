@@ -16,7 +16,7 @@ from metrpo.config import Config
 from metrpo.errors import MetrpoError, RunDirectoryError, TaskError
 from metrpo.evaluation import evaluate, render
 from metrpo.hub import repository
-from metrpo.run.policy_file import save_policy
+from metrpo.run.policy_file import Learned, save_policy
 from metrpo.run.push import parcel
 from metrpo.world.registry import get_task
 from seen_runs import a_run
@@ -31,7 +31,9 @@ def a_finished_run(folder, config=CONFIG, returns=(1.5, 34.25)):
         for i, value in enumerate(returns, 1)
     ]
     a_run(folder, config, rows)
-    save_policy(folder, random_policy(0, 10, 2), config.task, len(rows), 3000 * len(rows), returns[-1], settings=config)
+    save_policy(
+        folder, random_policy(0, 10, 2), config.task, Learned(len(rows), 3000 * len(rows), returns[-1]), settings=config
+    )
     yardsticks = {"task": config.task, "zero": {"mean": -1.25}, "random": {"mean": -2.5}}
     about = {"commit": "abc1234", "created": "2026-01-02T03:04", "yardsticks": yardsticks}
     (folder / "run.json").write_text(json.dumps(about))

@@ -19,7 +19,7 @@ from metrpo.config import Config, to_json
 from metrpo.errors import ConfigError, TaskError
 from metrpo.external import begin
 from metrpo.presets import override, preset
-from metrpo.run.policy_file import save_policy
+from metrpo.run.policy_file import Learned, save_policy
 from metrpo.run.task_file import moved, remember, task_of_run
 from metrpo.training import train
 from metrpo.world import resolve
@@ -125,7 +125,7 @@ def a_run(run_dir, task, **choice):
     (run_dir / "run.json").write_text('{"format": 1}')
     config = Config(task, **choice)
     remember(run_dir, config)
-    save_policy(run_dir, random_policy(0, 3, 1), task, 1, 200, 1.5, settings=config)
+    save_policy(run_dir, random_policy(0, 3, 1), task, Learned(1, 200, 1.5), settings=config)
 
 
 def evaluated(capsys, *arguments):
@@ -184,7 +184,7 @@ def test_the_folder_of_an_installed_module_is_not_kept(monkeypatch):
 
 
 def test_a_policy_may_be_evaluated_on_another_task_of_its_sizes(tmp_path, capsys):
-    save_policy(tmp_path / "run", random_policy(0, 11, 3), "Hopper", 1, 200, 1.5)
+    save_policy(tmp_path / "run", random_policy(0, 11, 3), "Hopper", Learned(1, 200, 1.5))
     assert evaluated(capsys, "run", "--task", "HopperUpright") == (0, "HopperUpright")
 
 

@@ -15,7 +15,7 @@ from PIL import Image
 from helpers import random_policy
 from metrpo.run import video
 from metrpo.run.metrics import to_csv
-from metrpo.run.policy_file import save_policy
+from metrpo.run.policy_file import Learned, save_policy
 from metrpo.run.video import VideoError, gl_backend, has_encoder, record
 from metrpo.world.registry import get_task
 
@@ -168,7 +168,7 @@ say_outcome(Path(sys.argv[1]), video=True)  # what a finished run says
 )
 def test_an_opengl_that_is_not_there_costs_the_video_only(asked, said, tmp_path):
     policy = random_policy(0, 10, 2)
-    save_policy(tmp_path, policy, "Swimmer", 1, 200, 1.5)
+    save_policy(tmp_path, policy, "Swimmer", Learned(1, 200, 1.5))
     row = {"iteration": 1, "real_steps": 200, "return_real": 1.5, "return_real_std": 0.5}
     (tmp_path / "metrics.csv").write_text(to_csv([row]))
     environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": asked}

@@ -41,7 +41,7 @@ def test_side_by_side_is_the_environment_step_by_step(name):
     """Same states, rewards and ends to the last bit, contacts and their solver's warm start included."""
     task = get_task(name)
     assert batch_episodes.applies(task)
-    episodes = batch_episodes.play(task, noisy(task), iter(range(3)), threads=2)
+    episodes = batch_episodes.play(task, noisy(task), iter(range(3)))
     assert len(episodes) == 3
     for seed, episode in enumerate(episodes):
         env = task.make_env()

@@ -36,44 +36,57 @@ class Line:
     """A band around it, [points] each."""
 
 
+@dataclass(frozen=True)
+class Axes:
+    """How the axes of a line chart run."""
+
+    frame: tuple[float, float] | None = None
+    """Limits of y; points beyond them are drawn as arrows at the edge."""
+    say_beyond: bool = True
+    """Their values stand beside such points."""
+    zero: bool = False
+    """y has it, and the line y = 0 is drawn."""
+    mark: float | None = None
+    """The line y = mark is drawn."""
+    log: bool = False
+    """x is logarithmic, and above zero."""
+    log_y: bool = False
+    """So is y, without a frame; what is not above zero is a gap."""
+
+
 def chart(
     title: str,
     lines: Sequence[Line],
     x_label: str,
     y_label: str,
     size: tuple[int, int] = (380, 230),
-    frame: tuple[float, float] | None = None,
-    zero: bool = False,
-    log: bool = False,
-    say_beyond: bool = True,
-    log_y: bool = False,
-    mark: float | None = None,
+    axes: Axes = Axes(),
 ) -> str:
-    """A line chart.
-
-    `frame` are the limits of the y axis; points beyond them are drawn as arrows at the edge, with their value beside
-    them if `say_beyond`. `zero`: the axis has it, and the line y = 0 is drawn. `log`: x is logarithmic, and above zero.
-    `log_y`: so is y, without a frame; what is not above zero is a gap. `mark`: the line y = mark is drawn.
-    """
-    if log_y:
+    """A line chart."""
+    if axes.log_y:
         lines = [replace(line, y=np.where(line.y > 0, line.y, np.nan)) for line in lines]
-    x0, x1 = _span([line.x for line in lines], floor=None if log else 0.0)
-    ys = [v for line in lines for v in (line.y, line.low, line.high) if v is not None]
-    ys += [] if mark is None else [np.array([mark])]
-    y0, y1 = _span(ys if frame is None else [np.array(frame)])
-    if zero and frame is None:
-        y0, y1 = min(y0, 0.0), max(y1, 0.0)
-    pad = 0.05 * (y1 - y0)
-    limits = (np.clip(y0, *_FAR) / 1.2, np.clip(y1, *_FAR) * 1.2) if log_y else (y0 - pad * (y0 != 0), y1 + pad)
-    place = _Place(size, (x0, x1), limits, log, log_y)
-    parts = [_axes(place, x_label, y_label, 0.0 if zero else mark)]
+    x_limits = _span([line.x for line in lines], floor=None if axes.log else 0.0)
+    place = _Place(size, x_limits, _y_limits(lines, axes), axes.log, axes.log_y)
+    parts = [_axes(place, x_label, y_label, 0.0 if axes.zero else axes.mark)]
     parts += [_band(line, place) for line in lines]
-    parts += [_line(line, place, say_beyond) for line in lines]
+    parts += [_line(line, place, axes.say_beyond) for line in lines]
     width, height = size
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{escape(title, quote=True)}">'
         f"{''.join(parts)}</svg>"
     )
+
+
+def _y_limits(lines: Sequence[Line], axes: Axes) -> tuple[float, float]:
+    ys = [v for line in lines for v in (line.y, line.low, line.high) if v is not None]
+    ys += [] if axes.mark is None else [np.array([axes.mark])]
+    low, high = _span(ys if axes.frame is None else [np.array(axes.frame)])
+    if axes.log_y:
+        return np.clip(low, *_FAR) / 1.2, np.clip(high, *_FAR) * 1.2
+    if axes.zero and axes.frame is None:
+        low, high = min(low, 0.0), max(high, 0.0)
+    pad = 0.05 * (high - low)
+    return low - pad * (low != 0), high + pad
 
 
 def bars(title: str, names: Sequence[str], columns: np.ndarray, x: Sequence[int], x_label: str, y_label: str) -> str:

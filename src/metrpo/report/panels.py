@@ -16,7 +16,7 @@ from metrpo.counting import counted
 from metrpo.plots.bands import RATIOS, curve, is_far, x_axis
 from metrpo.report import charts
 from metrpo.report.caption import figure, swatches
-from metrpo.report.charts import Line, bars, chart
+from metrpo.report.charts import Axes, Line, bars, chart
 from metrpo.report.trust import trust_of
 from metrpo.run.find import Group, SeenRun, no_skill
 from metrpo.run.metrics import is_clock
@@ -122,8 +122,8 @@ def _learning(task: str, seen: list[Seen], groups: list[Group], colours: dict[in
     levels = no_skill([s.run for s in seen])
     lines += [Line(_ends(lines), np.full(2, level), name, "level dashed", False) for name, level in levels.items()]
     title = f"Learning curves of {task}"
-    wide = chart(title, lines, x_label, y_label, size=(1120, 340), log=log)
-    narrow = chart(title, lines, x_label, y_label, log=log)
+    wide = chart(title, lines, x_label, y_label, size=(1120, 340), axes=Axes(log=log))
+    narrow = chart(title, lines, x_label, y_label, axes=Axes(log=log))
     seeds = max(len(g.runs) for g in groups)
     said = {1: "", 2: " Thin: seeds; thick: their mean; band: their range."}.get(
         seeds, " Thin: seeds; thick: their mean; band: its 95 % bootstrap interval (of two seeds, their range)."
@@ -149,9 +149,8 @@ def _across(seen: list[Seen], name: str, title: str, note: str, zero: bool, x: s
         return ""
     frame, log = _robust([line.y for line in lines]) if name == "gap" else None, is_far(x, [n.x[-1] for n in lines])
     log_y, mark = name.startswith(RATIOS), 1.0 if name.startswith("error_") else None
-    alone = len(lines) == 1
-    drawn = chart(title, lines, x_label, "", frame=frame, zero=zero, log=log, say_beyond=alone, log_y=log_y, mark=mark)
-    return figure(title, note, drawn)
+    axes = Axes(frame, len(lines) == 1, zero, mark, log, log_y)
+    return figure(title, note, chart(title, lines, x_label, "", axes=axes))
 
 
 def _is_zero(seen: list[Seen], name: str) -> bool:
@@ -166,7 +165,8 @@ def _trust(s: Seen, x: str, x_label: str) -> str:
         return ""
     lines = [Line(at, imagined, "imagined", "imagined"), Line(at, real, "real", "real thick")]
     lines = [line for line in lines if np.isfinite(line.y).any()]
-    drawn = chart(f"Real and imagined return of {s.name}", lines, x_label, "", frame=charts.real_frame(real, imagined))
+    axes = Axes(frame=charts.real_frame(real, imagined))
+    drawn = chart(f"Real and imagined return of {s.name}", lines, x_label, "", axes=axes)
     horizon = s.run.config.imagine.horizon
     return figure(s.name, f"imagined: {horizon} steps only, not to be compared" if horizon else "", drawn)
 
@@ -181,14 +181,14 @@ def _of_run(s: Seen, x: str, x_label: str) -> str:
             Line(at, run.column(name), f"model {name.rsplit('_', 1)[1]}", style, dots=False)
             for name, style in zip(losses, styles, strict=True)
         ]
-        drawn = chart("Validation loss", lines, x_label, "", zero=True)
+        drawn = chart("Validation loss", lines, x_label, "", axes=Axes(zero=True))
         legend = [(style, line.name) for style, line in zip(styles, lines, strict=True)]
         parts.append(figure("Validation loss", "of each model, on held-out real steps", drawn, legend))
     if np.isfinite(run.column("updates")).any():
         tried, kept, rejected = (run.column(n) for n in ("updates", "accepted_updates", "rejected_steps"))
         given = (("tried", tried, "c2"), ("accepted", kept, "c0"), ("rejected", rejected, "c3"))
         lines = [Line(at, y, name, style, dots=False) for name, y, style in given if np.isfinite(y).any()]
-        drawn = chart("Policy updates", lines, x_label, "", zero=True)
+        drawn = chart("Policy updates", lines, x_label, "", axes=Axes(zero=True))
         legend = [(line.style, line.name) for line in lines]
         parts.append(figure("Policy updates", "tried, accepted by validation, rejected unmoved", drawn, legend))
     stages = [name for name in run.rows[0] if name.startswith("seconds_") and np.nansum(run.column(name)) > 0]

@@ -8,7 +8,7 @@ import numpy as np
 
 from metrpo.checks.finding import after, horizons
 from metrpo.report.caption import figure
-from metrpo.report.charts import Line, chart, number
+from metrpo.report.charts import Axes, Line, chart, number
 from metrpo.report.heatmap import heat
 from metrpo.run.find import SeenRun
 from metrpo.run.metrics import column
@@ -38,7 +38,7 @@ def _errors(run: SeenRun, x: str, x_label: str) -> str:
         Line(run.column(x), run.column(f"error_{k}"), after(k), f"c{i}{' thick' * (k in ('1', 'T'))}", dots=few)
         for i, k in enumerate(known)
     ]
-    drawn = chart("Model error by steps predicted", lines, x_label, "", log_y=True, mark=1.0)
+    drawn = chart("Model error by steps predicted", lines, x_label, "", axes=Axes(log_y=True, mark=1.0))
     legend = [(line.style, line.name) for line in lines]
     note = "of predictions on held-out real episodes, over that of predicting no change"
     return figure("Model error", note, drawn, legend, f"Median over the state's dimensions; {_NO_CHANGE}.")
@@ -75,7 +75,7 @@ def _disagreement(run: SeenRun, x: str, x_label: str) -> str:
     lines = [Line(run.column(x), y, name, style) for n, name, style in given if np.isfinite(y := run.column(n)).any()]
     if not lines:
         return ""
-    drawn = chart("Disagreement of the models on real and imagined states", lines, x_label, "", log_y=True)
+    drawn = chart("Disagreement of the models on real and imagined states", lines, x_label, "", axes=Axes(log_y=True))
     note = "spread of the models' predictions, in standard deviations of the data"
     below = "Imagined far above real: the policy has gone where the models guess."
     return figure("Disagreement", note, drawn, [(line.style, line.name) for line in lines], below)
@@ -104,7 +104,7 @@ def _coverage(run: SeenRun, x: str, x_label: str) -> str:
     if not np.isfinite(outside).any():
         return ""
     line = Line(run.column(x), outside, "outside", "c3")
-    drawn = chart("Imagined states outside the data", [line], x_label, "", zero=True)
+    drawn = chart("Imagined states outside the data", [line], x_label, "", axes=Axes(zero=True))
     note = "share of the imagined states beyond the range of the real ones in any dimension"
     return figure("Outside the data", note, drawn, (), "There the models guess: no real step has been so far out.")
 

@@ -48,7 +48,7 @@ from metrpo.run.metrics import (
     to_csv,
     without_clocks,
 )
-from metrpo.run.policy_file import Interface, Weights, save_policy
+from metrpo.run.policy_file import Interface, Learned, Weights, save_policy
 from metrpo.safe_load import text_of
 
 _log = logging.getLogger("metrpo")
@@ -242,9 +242,9 @@ class RunDirectory:
     def _write_policy(self, state: Saved) -> None:
         result = self.rows[-1].get("return_real") if self.rows else None
         result = result if result is not None and math.isfinite(result) else None
-        progress = (state.iteration, state.real_steps, result)
+        learned = Learned(state.iteration, state.real_steps, result)
         origin = getattr(state, "origin", None)  # baselines have none
-        save_policy(self.path, state.policy, self.config.task, *progress, self.interface, origin, self.config)
+        save_policy(self.path, state.policy, self.config.task, learned, self.interface, origin, self.config)
 
     def _draw_curve(self) -> None:
         title = f"{self.config.task}, {self.config.system}, {self.config.preset}, seed {self.config.seed}"

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -76,6 +76,17 @@ _LIMITS = ("max_action", "max_change")
 """Fields that say what its actions are held to."""
 _SINCE = dict.fromkeys(_SHOWN) | {"env_kwargs": [], "imports": [], "max_action": 1.0, "max_change": None, "history": 1}
 """Fields that older policies lack, and what that means."""
+
+
+class Learned(NamedTuple):
+    """How far a run had come when it had a policy."""
+
+    iteration: int
+    """Outer iterations of training."""
+    real_steps: int
+    """Real steps that it had learned from."""
+    return_real: float | None
+    """Mean real return of the policy without noise; None: not known."""
 
 
 class Interface(Protocol):
@@ -233,9 +244,7 @@ def save_policy(
     directory: Path,
     policy: Weights,
     task: str,
-    iteration: int,
-    real_steps: int,
-    return_real: float | None,
+    learned: Learned,
     interface: Interface | None = None,
     origin: np.ndarray | None = None,
     settings: Config | None = None,
@@ -251,7 +260,7 @@ def save_policy(
     history = 1 if settings is None else settings.history
     layout = History.of_state(history, layers[0][0].shape[0], layers[-1][0].shape[1])
     sizes = (layout.observation_size, layout.action_size, hidden)
-    info = PolicyInfo(task, *sizes, iteration, real_steps, return_real, history=history)
+    info = PolicyInfo(task, *sizes, *learned, history=history)
     info = with_interface(info, interface)
     if settings is not None:
         info = replace(info, **{name: getattr(settings, name) for name in (*_MADE, *_LIMITS)})

@@ -115,7 +115,6 @@ def play(
     at_least: float = math.inf,
     longest: int | None = None,
     on_steps: Callable[[int], None] = lambda steps: None,
-    threads: int | None = None,
     at_most: float = math.inf,
 ) -> list[Episode]:
     """Whole episodes from resets by `seeds`, until they have `at_least` steps together or the seeds are used up.
@@ -123,7 +122,7 @@ def play(
     The very episodes that playing one after another would give, in the order of their seeds: another one begins only
     when those before it cannot have enough steps. An episode of more than `longest` steps is cut there, and one that
     begins where fewer than that remain of `at_most` steps of all together, after those. `on_steps(steps so far)`
-    follows every step; `threads` (by default as many as cores) share the physics.
+    follows every step. As many threads as there are cores share the physics.
 
     Raises `EpisodeError` where a simulation diverges, `TaskError` where the policy is another task's, `DivergedError`
     where it gives NaN.
@@ -133,7 +132,7 @@ def play(
     running: dict[int, _Running] = {}
     free = list(range(SLOTS))[::-1]
     steps = begun = 0
-    with closing(SideBySide(task, threads or _cores())) as slots:
+    with closing(SideBySide(task, _cores())) as slots:
         while True:
             while free and (taken := steps + _left(running)) < min(at_least, at_most):
                 if (seed := next(seeds, None)) is None:
