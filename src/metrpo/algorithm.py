@@ -29,6 +29,7 @@ from metrpo.policy import gaussian
 from metrpo.policy.inputs import folded
 from metrpo.policy.value.table import init_baseline
 from metrpo.run.clock import Clock
+from metrpo.run.metrics import Row
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.stages.ensemble_fit import fit_ensemble, fresh_networks
 from metrpo.stages.log import Log, Unkept, left_out
@@ -36,7 +37,7 @@ from metrpo.stages.policy_search import improve_policy
 from metrpo.stages.proven import prove, settle, steps_kept_for_proof
 from metrpo.stages.real_steps import collect
 from metrpo.stages.records import NOTHING, Done, Real, record
-from metrpo.stages.state import Proven, Row, State, inputs_for
+from metrpo.stages.state import Proven, State, inputs_for
 from metrpo.types import Episode
 from metrpo.world import dataset as datasets
 from metrpo.world import offline_data

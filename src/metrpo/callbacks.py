@@ -12,7 +12,7 @@ from metrpo.stages.log import Log
 from metrpo.types import Episode
 
 _log = logging.getLogger("metrpo")
-Row = Mapping[str, int | float | None]
+IterationRow = Mapping[str, int | float | None]
 
 
 class Callback(Protocol):
@@ -21,7 +21,7 @@ class Callback(Protocol):
     What a callback raises costs a warning, and that callback is called no more: it may not cost what is learned.
     """
 
-    def on_begin(self, config: Config, run_dir: Path | None, rows: Sequence[Row]) -> None:
+    def on_begin(self, config: Config, run_dir: Path | None, rows: Sequence[IterationRow]) -> None:
         """Training begins, or goes on after the iterations in `rows`."""
 
     def on_episode(self, episode: Episode) -> None:
@@ -30,7 +30,7 @@ class Callback(Protocol):
         Its states hold the run's history (`config.history`); the newest observation comes first.
         """
 
-    def on_iteration(self, row: Row) -> None:
+    def on_iteration(self, row: IterationRow) -> None:
         """An outer iteration is finished, with this row of `metrics.csv`."""
 
     def on_checkpoint(self, checkpoint: Path) -> None:
@@ -46,7 +46,7 @@ class Callbacks(Callback):
     def __init__(self, callbacks: Sequence[Callback]) -> None:
         self._callbacks = list(callbacks)
 
-    def on_begin(self, config: Config, run_dir: Path | None, rows: Sequence[Row]) -> None:
+    def on_begin(self, config: Config, run_dir: Path | None, rows: Sequence[IterationRow]) -> None:
         """Passed on."""
         self._tell(lambda one: one.on_begin(config, run_dir, rows))
 
@@ -54,7 +54,7 @@ class Callbacks(Callback):
         """Passed on."""
         self._tell(lambda one: one.on_episode(episode))
 
-    def on_iteration(self, row: Row) -> None:
+    def on_iteration(self, row: IterationRow) -> None:
         """Passed on."""
         self._tell(lambda one: one.on_iteration(row))
 

@@ -28,7 +28,7 @@ from metrpo.policy.improvers.table import IMPROVERS, Memory, init_memory
 from metrpo.policy.inputs import Inputs, folded, normalised, unfolded
 from metrpo.policy.stopping import RULES, Evidence, improved
 from metrpo.policy.value.table import VALUE_FUNCTIONS, Baseline
-from metrpo.types import Act, Array, Trajectories
+from metrpo.types import Array, SampleActions, Trajectories
 from metrpo.world.task import Task
 
 
@@ -221,7 +221,7 @@ def _compiled_updates(
 
 
 def _simulate(
-    simulator: Simulator, act: Act, starts: Float[Array, "N S"], key: Key[Array, ""]
+    simulator: Simulator, act: SampleActions, starts: Float[Array, "N S"], key: Key[Array, ""]
 ) -> tuple[Trajectories, ImagineInfo]:
     """Imagined episodes as the policy sees them."""
     inputs = simulator.inputs

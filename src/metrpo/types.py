@@ -70,7 +70,11 @@ class Trajectories(NamedTuple):
     """1 where the episode has neither ended nor diverged by then."""
 
 
-Act = Callable[[Float[Array, "N S"], Key[Array, ""]], Float[Array, "N A"]]
+RewardFormula = Callable[[Array, Array, Array], Array]
+"""r(s, a, s'): [..., S], [..., A], [..., S] -> [...]; `a` within [-1, 1]; NumPy or JAX arrays alike."""
+EndFormula = Callable[[Array], Array]
+"""Whether an episode ends in s': [..., S] -> [...] of bool."""
+SampleActions = Callable[[Float[Array, "N S"], Key[Array, ""]], Float[Array, "N A"]]
 """(states, key) -> actions."""
-Simulate = Callable[[Act, Float[Array, "N S"], Key[Array, ""]], tuple[Trajectories, Any]]
+Simulate = Callable[[SampleActions, Float[Array, "N S"], Key[Array, ""]], tuple[Trajectories, Any]]
 """(act, start states, key) -> imagined episodes, and what they looked like."""

@@ -23,9 +23,9 @@ from metrpo.policy.improvers.batch import ImproveInfo
 from metrpo.policy.improvers.table import batch_of
 from metrpo.policy.value.table import Baseline, init_baseline
 from metrpo.run.clock import Clock
+from metrpo.run.metrics import Row
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.stages.records import recorded_returns
-from metrpo.stages.state import Row
 from metrpo.types import Array, Trajectories
 from metrpo.world.task import Task
 
@@ -33,7 +33,7 @@ _EPISODES = 64
 """Batches are padded to a multiple of so many episodes: where these end early their number changes all the time."""
 
 
-class State(NamedTuple):
+class TRPOState(NamedTuple):
     """Everything that an iteration hands to the next."""
 
     iteration: int
@@ -42,15 +42,17 @@ class State(NamedTuple):
     baseline: Baseline
 
 
-def init(config: Config, task: Task) -> State:
+def init(config: Config, task: Task) -> TRPOState:
     """The state before the first iteration."""
     p = config.policy
     key = key_of(config.seed, 0, Stage.INIT)
     policy = gaussian.init(key, task.state_size, task.action_size, p.hidden, p.initial_std)
-    return State(0, 0, policy, init_baseline(config.advantage, task.state_size, key_of(config.seed, 0, Stage.IMPROVE)))
+    return TRPOState(
+        0, 0, policy, init_baseline(config.advantage, task.state_size, key_of(config.seed, 0, Stage.IMPROVE))
+    )
 
 
-def step(config: Config, task: Task, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
+def step(config: Config, task: Task, state: TRPOState, progress: Progress = SILENT) -> tuple[TRPOState, Row]:
     """One update of TRPO on `config.collect.steps` real steps, or on what is left of the budget."""
     iteration, clock = state.iteration + 1, Clock()
     with clock("collect"):
@@ -69,7 +71,7 @@ def step(config: Config, task: Task, state: State, progress: Progress = SILENT) 
         progress.stage("evaluate", config.evaluation_episodes)
         returns = recorded_returns(config, task, policy, iteration)
     steps = state.real_steps + sum(len(e.rewards) for e in drawn.episodes)
-    row = {
+    row: Row = {
         "iteration": iteration,
         "real_steps": steps,
         "return_real": float(np.mean(returns)),
@@ -80,7 +82,7 @@ def step(config: Config, task: Task, state: State, progress: Progress = SILENT) 
         "mean_std": float(np.mean(np.exp(policy.log_std))),
         **clock.row(),
     }
-    return State(iteration, steps, policy, baseline), row
+    return TRPOState(iteration, steps, policy, baseline), row
 
 
 def trajectories(drawn: Drawn, horizon: int) -> Trajectories:

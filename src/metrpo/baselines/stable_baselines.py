@@ -23,9 +23,9 @@ from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import MetrpoError
 from metrpo.policy.gaussian import Policy
 from metrpo.run.clock import Clock
+from metrpo.run.metrics import Row
 from metrpo.seeds import Stage, rng_of
 from metrpo.stages.records import recorded_returns
-from metrpo.stages.state import Row
 from metrpo.world.env_returns import closing
 from metrpo.world.task import Task
 
@@ -52,7 +52,7 @@ except ImportError as error:
     ) from error
 
 
-class State(NamedTuple):
+class SB3State(NamedTuple):
     """Everything that an iteration hands to the next: a pytree of NumPy arrays whose structure the config fixes."""
 
     iteration: int
@@ -71,13 +71,13 @@ class State(NamedTuple):
     """DDPG's n transitions, the oldest first: `_REPLAY`, float32, [n, S] twice, [n, A], [n] twice. Empty for PPO."""
 
 
-def init(config: Config, task: Task) -> State:
+def init(config: Config, task: Task) -> SB3State:
     """The state before the first iteration."""
     with closing(_environment(task), task.name) as env:
         return _state(config, _model(config, env, _seed(config, 0, Stage.INIT), None), 0)
 
 
-def step(config: Config, task: Task, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
+def step(config: Config, task: Task, state: SB3State, progress: Progress = SILENT) -> tuple[SB3State, Row]:
     """One outer iteration: learning for `collect.steps` real steps, or what is left of the budget, in whole updates."""
     iteration, clock = state.iteration + 1, Clock()
     with closing(_environment(task), task.name) as env, clock("improve"):
@@ -136,7 +136,7 @@ def _seed(config: Config, iteration: int, stage: Stage) -> int:
 # ---------------------------------------------------------------- the two algorithms
 
 
-def _ppo(config: Config, env: Monitor, seed: int, _: State | None) -> NormedPPO:
+def _ppo(config: Config, env: Monitor, seed: int, _: SB3State | None) -> NormedPPO:
     hidden, settings = list(config.policy.hidden), defaults.PPO_SETTINGS | {"gamma": config.advantage.discount}
     networks: dict[str, Any] = {"net_arch": {"pi": hidden, "vf": hidden}, "activation_fn": torch.nn.Tanh}
     networks |= {"log_std_init": math.log(config.policy.initial_std), **_standardised(env)}
@@ -150,7 +150,7 @@ def _ppo_policy(model: Any) -> Policy:
     return Policy(_raw(model, _layers(mean)), _numpy(model.policy.log_std))
 
 
-def _ddpg(config: Config, env: Monitor, seed: int, state: State | None) -> NormedDDPG:
+def _ddpg(config: Config, env: Monitor, seed: int, state: SB3State | None) -> NormedDDPG:
     steps, kept = config.collect.steps, len(state.replay["rewards"]) if state else 0
     action = np.zeros(env.action_space.shape)
     sizes = {"pi": list(config.policy.hidden), "qf": list(defaults.DDPG_CRITIC)}
@@ -211,7 +211,7 @@ _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones")
 """The arrays of the replay buffer; the last is 1 where the episode ended."""
 
 
-def _model(config: Config, env: Monitor, seed: int, state: State | None) -> Any:
+def _model(config: Config, env: Monitor, seed: int, state: SB3State | None) -> Any:
     """The algorithm as `state` left it (None: fresh); all its randomness and the environment's come from `seed`."""
     torch.set_num_threads(1)
     model = _METHODS[config.method][0](config, env, seed, state)
@@ -229,8 +229,8 @@ def _model(config: Config, env: Monitor, seed: int, state: State | None) -> Any:
     return model
 
 
-def _state(config: Config, model: Any, iteration: int) -> State:
-    return State(
+def _state(config: Config, model: Any, iteration: int) -> SB3State:
+    return SB3State(
         iteration=iteration,
         real_steps=model.num_timesteps,
         policy=_METHODS[config.method][1](model),

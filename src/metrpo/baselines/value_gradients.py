@@ -30,9 +30,9 @@ from metrpo.policy.advantage import discounted_returns
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers.adam import ascend, init_moments
 from metrpo.run.clock import Clock
+from metrpo.run.metrics import Row
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.stages.records import recorded_returns
-from metrpo.stages.state import Row
 from metrpo.types import Array, Episode, Normaliser, Transitions
 from metrpo.world import dataset as datasets
 from metrpo.world.task import Task
@@ -49,7 +49,7 @@ class PolicySettings:
     discount: float
 
 
-class State(NamedTuple):
+class SVGState(NamedTuple):
     """Everything that an iteration hands to the next; `*_moments` are Adam's, which go on from episode to episode."""
 
     iteration: int
@@ -64,7 +64,7 @@ class State(NamedTuple):
     replay: Transitions
 
 
-class Path(NamedTuple):
+class RealPath(NamedTuple):
     """One real episode, padded to the horizon T."""
 
     states: Array
@@ -77,7 +77,7 @@ class Path(NamedTuple):
     """[T], 1 within the episode."""
 
 
-def init(config: Config, task: Task) -> State:
+def init(config: Config, task: Task) -> SVGState:
     """The state before the first iteration."""
     p, e = config.policy, config.ensemble
     if task.reward is None:
@@ -86,7 +86,7 @@ def init(config: Config, task: Task) -> State:
     policy = gaussian.init(keys[0], task.state_size, task.action_size, p.hidden, p.initial_std)
     networks = ensembles.init(keys[1], 1, task.state_size, task.action_size, e.hidden, task.observation_size)
     value = gaussian.init(keys[2], task.state_size + 1, 1, _VALUE_HIDDEN, 1.0)
-    return State(
+    return SVGState(
         iteration=0,
         real_steps=0,
         policy=policy,
@@ -99,7 +99,7 @@ def init(config: Config, task: Task) -> State:
     )
 
 
-def step(config: Config, task: Task, state: State, progress: Progress = SILENT) -> tuple[State, Row]:
+def step(config: Config, task: Task, state: SVGState, progress: Progress = SILENT) -> tuple[SVGState, Row]:
     """Episodes of `config.collect.steps` real steps together, each followed by training the model and the policy."""
     iteration, clock = state.iteration + 1, Clock()
     rng, key = rng_of(config.seed, iteration, Stage.COLLECT), key_of(config.seed, iteration, Stage.IMPROVE)
@@ -131,7 +131,7 @@ def step(config: Config, task: Task, state: State, progress: Progress = SILENT) 
         progress.stage("evaluate", config.evaluation_episodes)
         returns = recorded_returns(config, task, state.policy, iteration)
     state = state._replace(iteration=iteration, real_steps=state.real_steps + steps)
-    row = {
+    row: Row = {
         "iteration": iteration,
         "real_steps": state.real_steps,
         "return_real": float(np.mean(returns)),
@@ -148,7 +148,7 @@ def step(config: Config, task: Task, state: State, progress: Progress = SILENT) 
 
 
 def value_gradient(
-    task: Task, ensemble: Ensemble, policy: Policy, path: Path, discount: float, value: Policy | None = None
+    task: Task, ensemble: Ensemble, policy: Policy, path: RealPath, discount: float, value: Policy | None = None
 ) -> Policy:
     """The gradient of the path's discounted return with respect to the policy's parameters, the noise held fixed.
 
@@ -183,7 +183,7 @@ def value_gradient(
     return jax.grad(whole if value is None else by_steps)(policy)
 
 
-def _inferred(ensemble: Ensemble, policy: Policy, path: Path) -> tuple[Array, Array]:
+def _inferred(ensemble: Ensemble, policy: Policy, path: RealPath) -> tuple[Array, Array]:
     """What the model missed [T, S] and the policy's noise [T, A], such that both replay the path exactly."""
     states = path.states[:-1]
     predicted = jax.vmap(partial(_predict, ensemble))(states, jnp.clip(path.drawn, -1.0, 1.0))
@@ -201,9 +201,9 @@ def _value(value: Policy, normaliser: Normaliser, states: Array, time: Array) ->
     return gaussian.mean(value, jnp.concatenate([seen, time[:, None] / 100.0], axis=-1))[:, 0]
 
 
-def _path(states: np.ndarray, drawn: np.ndarray, rewards: np.ndarray, horizon: int) -> Path:
+def _path(states: np.ndarray, drawn: np.ndarray, rewards: np.ndarray, horizon: int) -> RealPath:
     missing = horizon - len(rewards)
-    return Path(
+    return RealPath(
         np.concatenate([states, np.repeat(states[-1:], missing, axis=0)]).astype(np.float32),
         np.concatenate([drawn, np.zeros((missing, drawn.shape[1]), np.float32)]),
         np.append(rewards, np.zeros(missing, np.float32)),
@@ -216,7 +216,9 @@ def _normaliser(config: Config, task: Task, replay: Transitions) -> Normaliser:
     return ensembles.normaliser_of(replay, e.std_floor, e.delta_std_floor, task.unseen)
 
 
-def _fit(config: Config, state: State, normaliser: Normaliser, replay: Transitions, key: Array) -> tuple[State, Array]:
+def _fit(
+    config: Config, state: SVGState, normaliser: Normaliser, replay: Transitions, key: Array
+) -> tuple[SVGState, Array]:
     learned = state.networks, state.model_moments
     networks, moments, loss = _train_model(config.fit, config.svg.model_steps, *learned, normaliser, replay, key)
     return state._replace(networks=networks, model_moments=moments), loss
@@ -249,8 +251,8 @@ def _train_model(
 
 
 def _improve(
-    config: Config, task: Task, state: State, normaliser: Normaliser, path: Path
-) -> tuple[State, Array, Array]:
+    config: Config, task: Task, state: SVGState, normaliser: Normaliser, path: RealPath
+) -> tuple[SVGState, Array, Array]:
     learned, norm, made = _train_policy(
         PolicySettings(config.svg, config.gradient, config.advantage.discount),
         task,
@@ -265,7 +267,7 @@ def _improve(
 
 @partial(jax.jit, static_argnames=("settings", "task"))
 def _train_policy(
-    settings: PolicySettings, task: Task, ensemble: Ensemble, learned: tuple[Policy, Any, Policy, Any], path: Path
+    settings: PolicySettings, task: Task, ensemble: Ensemble, learned: tuple[Policy, Any, Policy, Any], path: RealPath
 ) -> tuple[tuple[Policy, Any, Policy, Any], Array, Array]:
     policy, moments, value, value_moments = learned
     discount = settings.discount
@@ -279,7 +281,7 @@ def _train_policy(
 
 
 def _train_value(
-    settings: PolicySettings, normaliser: Normaliser, value: Policy, moments: Any, path: Path
+    settings: PolicySettings, normaliser: Normaliser, value: Policy, moments: Any, path: RealPath
 ) -> tuple[Policy, Any]:
     """The value network fitted to the path's own returns to go, which are the policy's."""
     optimizer = optax.adam(settings.svg.value_learning_rate)

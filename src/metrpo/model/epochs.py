@@ -37,7 +37,7 @@ class FitData(NamedTuple):
     validation: Transitions
 
 
-class Progress(NamedTuple):
+class FitState(NamedTuple):
     """Where a fit stands; all but Adam's count has the members first."""
 
     networks: Networks
@@ -83,29 +83,29 @@ def validation_loss(ensemble: Ensemble, validation: Transitions, loss_units: str
 
 @partial(jax.jit, static_argnames=("config", "mesh"), donate_argnums=0)
 def train_and_validate(
-    at: Progress,
+    at: FitState,
     data: FitData,
     config: FitConfig,
     mesh: Mesh,
     key: Key[Array, ""],
     steps: Int[Array, ""],
     passes: Int[Array, ""],
-) -> Progress:
+) -> FitState:
     """`steps` minibatches for every member, each device of `mesh` with its own members, then one validation."""
     own = jax.tree.map(lambda x: FIRST if x.ndim else WHOLE, at)
     block = spread(partial(_block, config=config), mesh, (own, WHOLE, WHOLE, WHOLE, WHOLE), own)
-    after: Progress = block(at, data, key, steps, passes)
+    after: FitState = block(at, data, key, steps, passes)
     return after
 
 
 def _block(
-    at: Progress,
+    at: FitState,
     data: FitData,
     key: Key[Array, ""],
     steps: Int[Array, ""],
     passes: Int[Array, ""],
     config: FitConfig,
-) -> Progress:
+) -> FitState:
     """One device's share of `train_and_validate`."""
     normaliser, train, validation = data
     optimizer = optimizer_of(config)
@@ -140,7 +140,7 @@ def _block(
     def keep_best(new: Float[Array, "K *rest"], best: Float[Array, "K *rest"]) -> Float[Array, "K *rest"]:
         return jnp.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, best)
 
-    return Progress(
+    return FitState(
         networks,
         optimizer_state,
         jax.tree.map(keep_best, networks, at.best_networks),

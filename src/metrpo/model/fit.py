@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int, Key, Shaped
 from metrpo import devices
 from metrpo.config import FitConfig
 from metrpo.model.ensemble import Ensemble, Networks
-from metrpo.model.epochs import FitData, Progress, optimizer_of, train_and_validate, validation_loss
+from metrpo.model.epochs import FitData, FitState, optimizer_of, train_and_validate, validation_loss
 from metrpo.types import Array, Normaliser, Transitions
 
 
@@ -57,7 +57,7 @@ def fit(
     """
     optimizer = optimizer_of(config)
     loss = validation_loss(Ensemble(networks, normaliser), validation, config.loss_units)
-    at = Progress(networks, optimizer.init(networks), networks, loss, jnp.zeros(loss.shape, jnp.int32), loss)
+    at = FitState(networks, optimizer.init(networks), networks, loss, jnp.zeros(loss.shape, jnp.int32), loss)
     at = jax.tree.map(jnp.copy, at)  # its buffers are given away below, the caller's are not
     mesh = devices.mesh(loss.size)
     at, data = devices.shared(at, mesh), devices.copied(FitData(normaliser, train, validation), mesh)

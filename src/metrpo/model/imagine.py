@@ -16,12 +16,12 @@ from metrpo.model.ensemble import Ensemble, Predictor, predict, predict_delta
 from metrpo.model.model_parallel import can_share, shared
 from metrpo.model.sampling import SAMPLINGS, Keys, for_all
 from metrpo.policy.inputs import Inputs
-from metrpo.types import Act, Array, Number, Trajectories
+from metrpo.types import Array, Number, SampleActions, Trajectories
 
-Reward = Callable[
+RewardFn = Callable[
     [Float[Array, "*batch S"], Float[Array, "*batch A"], Float[Array, "*batch S"]], Float[Array, "*batch"]
 ]
-Terminated = Callable[[Float[Array, "*batch S"]], Bool[Array, "*batch"]] | Literal["learned"]
+TerminationFn = Callable[[Float[Array, "*batch S"]], Bool[Array, "*batch"]] | Literal["learned"]
 
 EXPLODED = 1e6
 """A rollout with a state beyond this, or a reward beyond its square, has diverged, as has one that meets NaN."""
@@ -47,9 +47,9 @@ class Simulator:
     """
 
     ensemble: Ensemble
-    reward: Reward | None = field(metadata={"static": True})
+    reward: RewardFn | None = field(metadata={"static": True})
     """None: learned."""
-    terminated: Terminated | None = field(metadata={"static": True})
+    terminated: TerminationFn | None = field(metadata={"static": True})
     horizon: int = field(metadata={"static": True})
     """Steps of an episode."""
     sampling: str = field(default="step_rand", metadata={"static": True})
@@ -80,8 +80,8 @@ class ImagineInfo(NamedTuple):
 
 
 def outcome(
-    reward: Reward | None,
-    terminated: Terminated | None,
+    reward: RewardFn | None,
+    terminated: TerminationFn | None,
     states: Float[Array, "*batch S"],
     actions: Float[Array, "*batch A"],
     predicted: Float[Array, "*batch D"],
@@ -107,7 +107,7 @@ def disagreement(ensemble: Predictor, states: Float[Array, "N S"], actions: Floa
 
 
 def imagine(
-    simulator: Simulator, act: Act, starts: Float[Array, "N S"], key: Key[Array, ""]
+    simulator: Simulator, act: SampleActions, starts: Float[Array, "N S"], key: Key[Array, ""]
 ) -> tuple[Trajectories, ImagineInfo]:
     """Imagined episodes from `starts`, in which `act` sees the states as they are.
 

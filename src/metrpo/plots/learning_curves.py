@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 X = Literal["real_steps", "wall_seconds", "iteration"]
-Scale = Literal["auto", "linear", "log"]
+AxisScale = Literal["auto", "linear", "log"]
 Legend = Literal["below", "inside", "none"]
 FORMATS = ("png", "svg", "pdf")
 _DOTS = 25
@@ -54,9 +54,9 @@ class Look:
     y_label: str | None = None
     x_limits: tuple[float, float] | None = None
     y_limits: tuple[float, float] | None = None
-    x_scale: Scale = "auto"
+    x_scale: AxisScale = "auto"
     """Logarithmic by itself where some runs are many times longer than others."""
-    y_scale: Scale = "auto"
+    y_scale: AxisScale = "auto"
     """Logarithmic by itself for errors of models."""
     legend: Legend = "below"
 

@@ -228,7 +228,7 @@ def _iterations(tell: Tell) -> Iterations:
                 state, row = training.step(config, state)
                 run.save(state, row)
             seconds.append(time.perf_counter() - start)
-            stages = sum(value for name, value in row.items() if name.startswith("seconds_"))
+            stages = sum(float(value or 0) for name, value in row.items() if name.startswith("seconds_"))
             outside.append(1 - stages / seconds[-1])
             counts.append(len(seen))
     tell("starting a process")

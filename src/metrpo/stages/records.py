@@ -21,9 +21,10 @@ from metrpo.model.fit import FitInfo
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.policy_phase import PhaseInfo, imagined_horizon
+from metrpo.run.metrics import Row
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.stages.proven import Verdict
-from metrpo.stages.state import Row, State, on_host
+from metrpo.stages.state import State, on_host
 from metrpo.types import Episode
 from metrpo.world import batch_episodes
 from metrpo.world.collect import Act

@@ -15,9 +15,6 @@ from metrpo.policy.value.table import Baseline
 from metrpo.world.dataset import Dataset
 from metrpo.world.task import Task
 
-Row = dict[str, float | int]
-"""One iteration's metrics, in the order of metrics.csv's columns."""
-
 
 class Proven(NamedTuple):
     """The best policy so far, by real episodes without noise."""

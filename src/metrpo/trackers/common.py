@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from metrpo.callbacks import Callback, Row
+from metrpo.callbacks import Callback, IterationRow
 from metrpo.config import Config, flatten
 from metrpo.run.about import about, note
 from metrpo.run.metrics import overview
@@ -29,7 +29,7 @@ class Tracker(Callback):
         """Logs an iteration's numbers."""
         raise NotImplementedError
 
-    def on_begin(self, config: Config, run_dir: Path | None, rows: Sequence[Row]) -> None:
+    def on_begin(self, config: Config, run_dir: Path | None, rows: Sequence[IterationRow]) -> None:
         """Begins, with the rows that the tracker has not had; or goes on."""
         noted = about(run_dir) if run_dir is not None else {}
         earlier = noted.get(f"tracked_by_{self.name}")
@@ -41,12 +41,12 @@ class Tracker(Callback):
         for row in rows if earlier is None else ():
             self.on_iteration(row)
 
-    def on_iteration(self, row: Row) -> None:
+    def on_iteration(self, row: IterationRow) -> None:
         """Logs it."""
         self.log(numbers_of(row), int(row["iteration"] or 0))
 
 
-def numbers_of(row: Row) -> dict[str, float]:
+def numbers_of(row: IterationRow) -> dict[str, float]:
     """A row's finite numbers by column; not those of single models and dimensions."""
     found = overview(dict(row))
     return {name: float(value) for name, value in found.items() if value is not None and math.isfinite(value)}

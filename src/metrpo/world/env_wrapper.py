@@ -166,11 +166,11 @@ _INNER = ("env", "_env", "venv", "gym_env")
 """Where wrappers keep what they wrap."""
 
 
-Path = tuple[Any, ...]
+KeyPath = tuple[Any, ...]
 """The keys and indices that lead to a part of a space."""
 
 
-def parts(space: Any, path: Path = ()) -> Iterator[tuple[Path, Any]]:
+def parts(space: Any, path: KeyPath = ()) -> Iterator[tuple[KeyPath, Any]]:
     """The parts of Dicts and Tuples, in the order in which they are flattened, with the way to each; else the space."""
     inner: Any = getattr(space, "spaces", None)
     if not isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple):
@@ -184,7 +184,7 @@ def _several(texts: list[str]) -> str:
     return " and ".join([*texts[:3], *([f"{len(texts) - 3} more"] if len(texts) > 3 else [])])
 
 
-def _at(path: Path) -> str:
+def _at(path: KeyPath) -> str:
     return " at " + "".join(f"[{key!r}]" for key in path) if path else ""
 
 
@@ -197,7 +197,7 @@ def _part_at(space: Any, index: int) -> str:
     return ""
 
 
-def _misfit(space: Any, observation: Any) -> tuple[Path, Any, Any]:
+def _misfit(space: Any, observation: Any) -> tuple[KeyPath, Any, Any]:
     """The first part of a space that an observation does not fit: the way to it, the part, and what stands there."""
     for path, part in parts(space):
         value = observation

@@ -17,7 +17,7 @@ import gymnasium
 
 from metrpo.config.env_kwargs import keywords
 from metrpo.errors import MissingTaskError, TaskError
-from metrpo.types import Array
+from metrpo.types import EndFormula, RewardFormula
 from metrpo.world import env_returns, interface
 from metrpo.world.env_wrapper import Guarded
 from metrpo.world.size_limits import require_horizon
@@ -26,14 +26,12 @@ from metrpo.world.task import Task
 _DM_CONTROL_STEPS = 1000
 """Steps of an episode in every task of the control suite (Tassa et al. 2018), which Shimmy does not tell."""
 MakeEnv = Callable[..., gymnasium.Env[Any, Any]]
-Reward = Callable[[Array, Array, Array], Array]
-Terminated = Callable[[Array], Array]
 
 
 def task_of(
     env: str | MakeEnv,
-    reward: Reward | None = None,
-    terminated: Terminated | Literal["learned"] | None = "learned",
+    reward: RewardFormula | None = None,
+    terminated: EndFormula | Literal["learned"] | None = "learned",
     *,
     name: str | None = None,
     horizon: int | None = None,

@@ -11,7 +11,7 @@ import gymnasium
 from metrpo.errors import TaskError
 from metrpo.history import History
 from metrpo.limits import NONE, Limits
-from metrpo.types import Array
+from metrpo.types import EndFormula, RewardFormula
 from metrpo.world.env_wrapper import refuse_running_statistics
 from metrpo.world.interface import Interface
 from metrpo.world.size_limits import require_horizon, require_size
@@ -31,11 +31,10 @@ class Task:
     """A; actions lie in [-1, 1]."""
     horizon: int
     """T, steps per episode."""
-    reward: Callable[[Array, Array, Array], Array] | None
-    """r(s, a, s'): [..., S], [..., A], [..., S] -> [...]; `a` within [-1, 1]; NumPy or JAX arrays alike. None: learned,
-    as one more output of every model."""
-    terminated: Callable[[Array], Array] | Literal["learned"] | None = None
-    """Ends the episode in s': [..., S] -> [...] of bool; "learned": one more output of every model; None: never."""
+    reward: RewardFormula | None
+    """r(s, a, s'); None: learned, as one more output of every model."""
+    terminated: EndFormula | Literal["learned"] | None = None
+    """Ends the episode in s'; "learned": one more output of every model; None: never."""
     unseen: tuple[int, ...] = ()
     """State dimensions kept from the dynamics networks' input (global position), but predicted all the same."""
     description: str = ""

@@ -15,15 +15,15 @@ from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers.adam import ascend
 from metrpo.policy.improvers.batch import ImproveInfo, by_gradient, mean_kl
-from metrpo.types import Act, Array, Simulate
+from metrpo.types import Array, SampleActions, Simulate
 
 
-def deterministic(policy: Policy) -> Act:
+def deterministic(policy: Policy) -> SampleActions:
     """Acts by the mean: a = mu(s)."""
     return lambda states, key: gaussian.mean(policy, states)
 
 
-def stochastic(policy: Policy) -> Act:
+def stochastic(policy: Policy) -> SampleActions:
     """Acts by reparametrised samples, a = mu(s) + sigma x noise: gradients reach mu and sigma (Heess et al. 2015)."""
     return lambda states, key: gaussian.sample(policy, states, key)
 
@@ -31,7 +31,7 @@ def stochastic(policy: Policy) -> Act:
 def improve(
     policy: Policy,
     moments: Any,
-    act: Callable[[Policy], Act],
+    act: Callable[[Policy], SampleActions],
     simulate: Simulate,
     starts: Float[Array, "N S"],
     config: GradientConfig,

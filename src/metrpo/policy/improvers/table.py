@@ -22,7 +22,7 @@ from metrpo.policy.improvers.adam import init_moments
 from metrpo.policy.improvers.batch import Batch, ImproveInfo
 from metrpo.policy.improvers.settings import PhaseSettings
 from metrpo.policy.value.table import VALUE_FUNCTIONS, Baseline
-from metrpo.types import Act, Array, Simulate, Trajectories
+from metrpo.types import Array, SampleActions, Simulate, Trajectories
 
 
 class Memory(NamedTuple):
@@ -123,7 +123,7 @@ def _by_score_function(step: Step) -> Improver:
     return update
 
 
-def _through_models(act: Callable[[Policy], Act]) -> Improver:
+def _through_models(act: Callable[[Policy], SampleActions]) -> Improver:
     """Follows the gradient of the imagined return itself."""
 
     def update(

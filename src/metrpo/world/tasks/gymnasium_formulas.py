@@ -15,11 +15,8 @@ from typing import Any
 import gymnasium
 import mujoco
 
-from metrpo.types import Array
+from metrpo.types import Array, EndFormula, RewardFormula
 from metrpo.world.tasks import mbbl
-
-_Reward = Callable[[Array, Array, Array], Array]
-_Ends = Callable[[Array], Array]
 
 
 @dataclass(frozen=True)
@@ -30,10 +27,9 @@ class Known:
     """As the user types it, "Swimmer-v5" or "mbbl/Swimmer"."""
     make: Callable[..., gymnasium.Env[Any, Any]]
     """Makes the environment, with its own range of actions and its time limit; takes `render_mode`."""
-    reward: _Reward
-    """r(s, a, s'): [..., S], [..., A], [..., S] -> [...]; `a` within [-1, 1]; NumPy or JAX arrays alike."""
-    terminated: _Ends | None = None
-    """Ends the episode in s': [..., S] -> [...] of bool; None: never."""
+    reward: RewardFormula
+    terminated: EndFormula | None = None
+    """Ends the episode in s'; None: never."""
     unseen: tuple[int, ...] = ()
     """State dimensions on which the dynamics do not depend: global positions."""
     description: str = ""
@@ -54,7 +50,7 @@ def _finite(x: Array) -> Array:
     return x.__array_namespace__().isfinite(x).all(axis=-1)
 
 
-def _alive(terminated: _Ends, next_state: Array) -> Array:
+def _alive(terminated: EndFormula, next_state: Array) -> Array:
     """1 where the episode goes on, else 0."""
     return (~terminated(next_state)).astype(next_state.dtype)
 
@@ -153,7 +149,7 @@ def _humanoid_terminated(next_state: Array) -> Array:
     return ~((next_state[..., 2] > 1.0) & (next_state[..., 2] < 2.0))
 
 
-def _forward(seconds: float, control: float, terminated: _Ends | None = None) -> _Reward:
+def _forward(seconds: float, control: float, terminated: EndFormula | None = None) -> RewardFormula:
     """(x' - x) / seconds - control ||a||^2, and 1 while alive where something ends the episode."""
 
     def reward(state: Array, action: Array, next_state: Array) -> Array:
@@ -211,7 +207,11 @@ def _make(name: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
 
 
 def _known(
-    name: str, description: str, reward: _Reward, terminated: _Ends | None = None, unseen: tuple[int, ...] = ()
+    name: str,
+    description: str,
+    reward: RewardFormula,
+    terminated: EndFormula | None = None,
+    unseen: tuple[int, ...] = (),
 ) -> Known:
     """A task of Gymnasium; where global positions are unseen, they are added to the observation."""
     added = {"exclude_current_positions_from_observation": False} if unseen else {}

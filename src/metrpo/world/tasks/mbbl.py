@@ -21,9 +21,8 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from metrpo.errors import TaskError
-from metrpo.types import Array
+from metrpo.types import Array, RewardFormula
 
-_Reward = Callable[[Array, Array, Array], Array]
 _Step = tuple[NDArray[Any], float, bool, bool, dict[str, Any]]
 MAX_TORQUE = 2.0
 """N m, the torque of Gym's Pendulum at an action of 1."""
@@ -32,7 +31,7 @@ MAX_TORQUE = 2.0
 # ---------------------------------------------------------------- rewards, NumPy and JAX alike
 
 
-def _forward(speed: int, control: float, height: float | None = None) -> _Reward:
+def _forward(speed: int, control: float, height: float | None = None) -> RewardFormula:
     """r = s[speed] - control ||a||^2, and where a `height` is aimed at, - 3 (s[0] - height)^2 + 1."""
 
     def reward(state: Array, action: Array, next_state: Array) -> Array:
@@ -84,7 +83,7 @@ _ROBOTS = {
 }
 
 
-class Robot(MujocoEnv):
+class MbblRobot(MujocoEnv):
     """One of MBBL's tasks on MuJoCo: "HalfCheetah", "Swimmer", "Hopper" or "Ant".
 
     Observation [S] float64: positions without the global ones, velocities, and for Swimmer the x velocity (m/s) of the
@@ -220,7 +219,7 @@ class MbblTask:
     """Without a time limit."""
     horizon: int
     """T, steps per episode."""
-    reward: _Reward
+    reward: RewardFormula
     """r(s, a, s'): [..., S], [..., A], [..., S] -> [...]."""
     description: str
 
@@ -228,10 +227,10 @@ class MbblTask:
 TASKS: dict[str, MbblTask] = {
     "Pendulum": MbblTask(Pendulum, 200, pendulum_reward, "hang still"),
     "CartPole": MbblTask(CartPole, 200, cartpole_reward, "balance a pole on a cart"),
-    "HalfCheetah": MbblTask(Robot, 1000, _forward(8, 0.1), "two legs in a plane run along x"),
-    "Swimmer": MbblTask(Robot, 1000, _forward(8, 1e-4), "3 links swim head first along x"),
-    "Hopper": MbblTask(Robot, 1000, _forward(5, 0.1, 1.3), "one leg hops along x at a height of 1.3 m"),
-    "Ant": MbblTask(Robot, 1000, _forward(13, 0.1, 0.57), "four legs walk along x at a height of 0.57 m"),
+    "HalfCheetah": MbblTask(MbblRobot, 1000, _forward(8, 0.1), "two legs in a plane run along x"),
+    "Swimmer": MbblTask(MbblRobot, 1000, _forward(8, 1e-4), "3 links swim head first along x"),
+    "Hopper": MbblTask(MbblRobot, 1000, _forward(5, 0.1, 1.3), "one leg hops along x at a height of 1.3 m"),
+    "Ant": MbblTask(MbblRobot, 1000, _forward(13, 0.1, 0.57), "four legs walk along x at a height of 0.57 m"),
 }
 """By name in the benchmark."""
 
@@ -239,6 +238,6 @@ TASKS: dict[str, MbblTask] = {
 def make(name: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
     """The environment of that name with its time limit (`kwargs` such as `render_mode="rgb_array"`)."""
     task = TASKS[name]
-    named = {"name": name} if task.env is Robot else {}
+    named = {"name": name} if task.env is MbblRobot else {}
     spec = EnvSpec(f"mbbl/{name}-v0", task.env, max_episode_steps=task.horizon, disable_env_checker=True, kwargs=named)
     return gymnasium.make(spec, **kwargs)

@@ -1,15 +1,12 @@
 """The paper's six tasks on MuJoCo (its appendix "Environment details"; the physics are rllab's)."""
 
-from collections.abc import Callable
-
 from metrpo.environment_ids import HORIZONS, env_id, register_ids
-from metrpo.types import Array
+from metrpo.types import EndFormula, RewardFormula
 from metrpo.world.interface import of_paper_task
 from metrpo.world.registry import register
 from metrpo.world.task import Task
 from metrpo.world.tasks.rllab.bodies import ANT, CHEETAH, HOPPER, HUMANOID, LYING, ROBOTS, SNAKE, SWIMMER, Robot
 from metrpo.world.tasks.rllab.rewards import (
-    Reward,
     ant_terminated,
     hopper_reward,
     hopper_upright_reward,
@@ -22,10 +19,10 @@ def _add(
     robot: Robot,
     name: str,
     sizes: tuple[int, int],
-    reward: Reward,
+    reward: RewardFormula,
     unseen: tuple[int, ...],
     description: str,
-    terminated: Callable[[Array], Array] | None = None,
+    terminated: EndFormula | None = None,
 ) -> None:
     """Makes a task known to metrpo; Gymnasium knows it by `metrpo.environment_ids`, with its time limit."""
     ROBOTS[name] = robot

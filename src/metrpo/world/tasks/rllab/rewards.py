@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from metrpo.types import Array
-
-Reward = Callable[[Array, Array, Array], Array]
+from metrpo.types import Array, RewardFormula
 
 
 def _squared_norm(action: Array) -> Array:
     return (action * action).sum(axis=-1)
 
 
-def velocity_reward(index: int, control: float, bonus: float = 0.0) -> Reward:
+def velocity_reward(index: int, control: float, bonus: float = 0.0) -> RewardFormula:
     """r = v_x - control ||a||^2 + bonus, with v_x = s'[index]."""
 
     def reward(state: Array, action: Array, next_state: Array) -> Array:
