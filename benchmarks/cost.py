@@ -27,8 +27,8 @@ from metrpo import get_task, policy_phase, preset  # noqa: E402
 from metrpo.model import ensemble as ensembles  # noqa: E402
 from metrpo.model.fit import fit  # noqa: E402
 from metrpo.policy import gaussian  # noqa: E402
+from metrpo.policy.improvers.improver_table import init_memory  # noqa: E402
 from metrpo.policy.improvers.settings import PhaseSettings  # noqa: E402
-from metrpo.policy.improvers.table import init_memory  # noqa: E402
 from metrpo.policy.value import linear  # noqa: E402
 from metrpo.presets import override  # noqa: E402
 from metrpo.types import Transitions  # noqa: E402

@@ -21,7 +21,7 @@ from metrpo.model import ensemble as ensembles
 from metrpo.policy import gaussian
 from metrpo.run.checkpoint import load_state
 from metrpo.types import Episode
-from metrpo.world.collect import collect
+from metrpo.world.collection import collect
 from metrpo.world.registry import task_for
 
 

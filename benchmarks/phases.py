@@ -23,7 +23,7 @@ from metrpo.console.progress import SILENT
 from metrpo.model import ensemble as ensembles
 from metrpo.model.diagnostics import diagnose
 from metrpo.model.ensemble import Carried, Ensemble
-from metrpo.policy.value.table import init_baseline
+from metrpo.policy.value.value_table import init_baseline
 from metrpo.presets import override
 from metrpo.run.clock import Clock
 from metrpo.run.directory import RunDirectory

@@ -2,7 +2,7 @@
 
     taskset -c 0 python benchmarks/real_steps.py
 
-plays the paper's tasks with a fresh policy (32-32) by `metrpo.world.collect.evaluate` and by
+plays the paper's tasks with a fresh policy (32-32) by `metrpo.world.collection.evaluate` and by
 `metrpo.world.batch_episodes.evaluate`, in turns; medians of five. Time is the process's own, so that
 others on the core count little, and threads add up: pin it to one core.
 """
@@ -18,7 +18,7 @@ import numpy as np
 
 from metrpo import get_task
 from metrpo.policy import gaussian
-from metrpo.world import batch_episodes, collect
+from metrpo.world import batch_episodes, collection
 
 EPISODES = {"Swimmer": 20, "Snake": 20, "Hopper": 64, "HalfCheetah": 64, "Ant": 64, "Humanoid": 20}
 
@@ -29,12 +29,12 @@ def main() -> None:
         task = get_task(name)
         fresh = gaussian.init(jax.random.key(0), task.state_size, task.action_size, (32, 32), 1.0)
         act = partial(gaussian.mean, jax.tree.map(np.asarray, fresh))
-        seeds = map(collect.seed_of, [np.random.default_rng(0)] * episodes)
+        seeds = map(collection.seed_of, [np.random.default_rng(0)] * episodes)
         played = batch_episodes.play(task, lambda states, numbers, steps: act(states), seeds)  # noqa: B023
         steps = sum(len(e.rewards) for e in played)
         rates: dict[str, list[float]] = {"one": [], "many": []}
         for _ in range(5):
-            for kind, play in (("one", collect.evaluate), ("many", batch_episodes.evaluate)):
+            for kind, play in (("one", collection.evaluate), ("many", batch_episodes.evaluate)):
                 start = time.process_time()
                 play(task, act, episodes, 0)
                 rates[kind].append(steps / (time.process_time() - start))

@@ -21,8 +21,8 @@ from metrpo.model.imagine import ImagineInfo, Simulator, imagine
 from metrpo.policy import gaussian
 from metrpo.policy.improvers import trpo
 from metrpo.policy.improvers.batch import Batch, ImproveInfo
+from metrpo.policy.improvers.improver_table import Memory
 from metrpo.policy.improvers.settings import PhaseSettings
-from metrpo.policy.improvers.table import Memory
 from metrpo.policy.inputs import folded, inputs_of, normalised
 from metrpo.policy.value import linear
 from metrpo.presets import override, preset

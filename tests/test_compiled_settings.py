@@ -14,10 +14,10 @@ import pytest
 import metrpo
 from metrpo.config import AdvantageConfig, Config, ImagineConfig, ValidateConfig
 from metrpo.model.sampling import SAMPLINGS
+from metrpo.policy.improvers.improver_table import IMPROVERS
 from metrpo.policy.improvers.settings import PhaseSettings
-from metrpo.policy.improvers.table import IMPROVERS
 from metrpo.policy.stopping import RULES
-from metrpo.policy.value.table import VALUE_FUNCTIONS
+from metrpo.policy.value.value_table import VALUE_FUNCTIONS
 from metrpo.presets import override
 
 ROOMS = ("algorithm", "stages", "policy_phase", "model", "policy", "baselines")

@@ -134,7 +134,7 @@ def test_a_damaged_checkpoint_costs_no_real_episode(uninterrupted, tmp_path, cap
         pytest.fail("the real data was there")
         yield
 
-    monkeypatch.setattr("metrpo.world.collect.play", nobody)
+    monkeypatch.setattr("metrpo.world.collection.play", nobody)
     train(config(), tmp_path)
     assert "iteration-00002.npz is damaged" in caplog.text
     assert "going on from iteration-00001.npz" in caplog.text

@@ -29,12 +29,12 @@ from metrpo.model.sampling import SAMPLINGS
 from metrpo.policy import gaussian
 from metrpo.presets import override, preset
 from metrpo.run.episodes import EpisodeLog, append_episode
-from metrpo.run.export import export
 from metrpo.run.files import read_arrays, write_arrays
 from metrpo.run.metrics import read_metrics
+from metrpo.run.policy_export import export
 from metrpo.run.policy_file import Learned, load_policy, save_policy
 from metrpo.training import train
-from metrpo.world import collect, dataset, offline_data, registry
+from metrpo.world import collection, dataset, offline_data, registry
 from metrpo.world.history_env import with_history
 from metrpo.world.registry import task_for
 
@@ -114,7 +114,7 @@ def test_a_state_that_holds_no_such_history_is_refused(length, size):
 
 def explored(task, steps=400):
     rng = np.random.default_rng(0)
-    return collect.collect(task, lambda rng: lambda state: rng.uniform(-1, 1, 2), steps, rng)
+    return collection.collect(task, lambda rng: lambda state: rng.uniform(-1, 1, 2), steps, rng)
 
 
 def unexplained(task, episodes):
@@ -136,9 +136,9 @@ def test_late_actions_can_be_predicted_from_a_history_and_not_without():
 @pytest.mark.parametrize("sampling", SAMPLINGS)
 def test_imagination_with_the_true_models_is_reality(sampling):
     simulator = Simulator(late.true_models(5), SEEN.reward, None, SEEN.horizon, sampling=sampling)
-    starts = collect.reset_states(SEEN, 1, np.random.default_rng(0)).astype(np.float32)
+    starts = collection.reset_states(SEEN, 1, np.random.default_rng(0)).astype(np.float32)
     mean = partial(gaussian.mean, POLICY)
-    episode = next(collect.play(SEEN, lambda _: mean, [np.random.default_rng(0)]))
+    episode = next(collection.play(SEEN, lambda _: mean, [np.random.default_rng(0)]))
     rollouts, _ = jax.jit(lambda s, k: imagine(simulator, lambda s, _: gaussian.mean(POLICY, s), s, k))(
         starts, jax.random.key(0)
     )

@@ -18,10 +18,10 @@ from metrpo.limits import Limits
 from metrpo.model.imagine import Simulator, imagine, returns_per_model
 from metrpo.policy import gaussian
 from metrpo.presets import override, preset
-from metrpo.run.export import export
 from metrpo.run.files import read_arrays, write_arrays
+from metrpo.run.policy_export import export
 from metrpo.run.policy_file import Learned, load_policy, save_policy
-from metrpo.world import batch_episodes, collect
+from metrpo.world import batch_episodes, collection
 from metrpo.world.registry import get_task, limited, task_for
 from places import ROOT
 
@@ -38,7 +38,7 @@ def test_collection_holds_every_policy_to_them():
     task = limited(probe.PROBE, BOTH)
     rng = np.random.default_rng(0)
     noisy = lambda rng: lambda state: 5 * rng.standard_normal(2)  # noqa: E731
-    free, held = (collect.collect(t, noisy, 100, rng) for t in (probe.PROBE, task))
+    free, held = (collection.collect(t, noisy, 100, rng) for t in (probe.PROBE, task))
     assert all(are_within(e.actions) for e in held)
     assert not any(are_within(e.actions) for e in free)
     assert max(abs(e.actions).max() for e in held) == np.float32(0.6), "as far as they may go"
@@ -48,9 +48,9 @@ def test_collection_holds_every_policy_to_them():
 def test_side_by_side_is_one_after_another(limits):
     task = limited(get_task("Swimmer"), limits)
     act = partial(gaussian.mean, random_policy(1, task.state_size, task.action_size))
-    expected = collect.evaluate(task, act, 3, seed=4)
+    expected = collection.evaluate(task, act, 3, seed=4)
     np.testing.assert_allclose(batch_episodes.evaluate(task, act, 3, seed=4), expected, rtol=1e-5)
-    assert not np.allclose(expected, collect.evaluate(get_task("Swimmer"), act, 3, seed=4))
+    assert not np.allclose(expected, collection.evaluate(get_task("Swimmer"), act, 3, seed=4))
 
 
 @pytest.mark.parametrize("limits", [BOTH, Limits(0.5)])
@@ -58,9 +58,9 @@ def test_imagination_through_the_true_dynamics_is_the_limited_reality(limits):
     ensemble = linear_ensemble([(probe.A, probe.B)] * 2)
     simulator = Simulator(ensemble, probe.reward, None, probe.HORIZON, limits=limits)
     rng = np.random.default_rng(0)
-    starts = np.array([collect.reset_states(probe.PROBE, 1, np.random.default_rng(0))[0]], np.float32)
+    starts = np.array([collection.reset_states(probe.PROBE, 1, np.random.default_rng(0))[0]], np.float32)
     mean = partial(gaussian.mean, LOUD)
-    real = collect.evaluate(limited(probe.PROBE, limits), lambda s: mean(np.float32(s)), 1, seed=0)
+    real = collection.evaluate(limited(probe.PROBE, limits), lambda s: mean(np.float32(s)), 1, seed=0)
     values = jax.jit(lambda s: returns_per_model(simulator, partial(gaussian.mean, LOUD), s))(starts)
     np.testing.assert_allclose(values, [real[0]] * 2, rtol=1e-3)
     imagined = jax.jit(lambda s, k: imagine(simulator, lambda s, _: gaussian.mean(LOUD, s), s, k))

@@ -26,8 +26,8 @@ from metrpo.presets import override, preset
 from metrpo.run import directory as directories
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.episodes import EpisodeLog
-from metrpo.run.export import export
 from metrpo.run.files import read_arrays, write_arrays
+from metrpo.run.policy_export import export
 from metrpo.run.policy_file import Learned, load_policy, save_policy
 from metrpo.stages import records
 from metrpo.types import Episode

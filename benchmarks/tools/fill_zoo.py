@@ -16,7 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from metrpo import load_policy, zoo
+from metrpo import load_policy
+from metrpo import policy_zoo as zoo
 from metrpo.errors import MetrpoError, TaskError
 from metrpo.policy.gaussian import Policy
 from metrpo.run.card import card_of

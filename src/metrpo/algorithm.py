@@ -27,7 +27,7 @@ from metrpo.errors import ConfigError
 from metrpo.finite import require_finite
 from metrpo.policy import gaussian
 from metrpo.policy.inputs import folded
-from metrpo.policy.value.table import init_baseline
+from metrpo.policy.value.value_table import init_baseline
 from metrpo.run.clock import Clock
 from metrpo.run.metrics import Row
 from metrpo.seeds import Stage, key_of, rng_of

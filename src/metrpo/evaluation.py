@@ -13,15 +13,15 @@ from metrpo.counting import counted
 from metrpo.errors import ConfigError, TaskError
 from metrpo.hub import is_on_hub
 from metrpo.limits import Limits
+from metrpo.policy_zoo import is_in_zoo, is_name, located
 from metrpo.run.policy_file import LoadedPolicy, PolicyInfo, load_policy
 from metrpo.run.task_file import task_of_run
 from metrpo.run.video import record
 from metrpo.safe_load import brief
-from metrpo.world import collect
+from metrpo.world import collection
 from metrpo.world.history_env import with_history
 from metrpo.world.registry import get_task, limited
 from metrpo.world.task import Task
-from metrpo.zoo import is_in_zoo, is_name, located
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def evaluate(
         _require_fit(act, known)
         known = with_history(limited(known, Limits.of(act.info)), act.info.history)
         act = act.of_state
-    return EvaluationResult(known.name, seed, collect.evaluate(known, act, episodes, seed))
+    return EvaluationResult(known.name, seed, collection.evaluate(known, act, episodes, seed))
 
 
 def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0, task: str | None = None) -> Path:

@@ -23,11 +23,11 @@ from metrpo.model.imagine import ImagineInfo, Simulator, imagine, returns_per_mo
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers.batch import ImproveInfo
+from metrpo.policy.improvers.improver_table import IMPROVERS, Memory, init_memory
 from metrpo.policy.improvers.settings import PhaseSettings
-from metrpo.policy.improvers.table import IMPROVERS, Memory, init_memory
 from metrpo.policy.inputs import Inputs, folded, normalised, unfolded
 from metrpo.policy.stopping import RULES, Evidence, improved
-from metrpo.policy.value.table import VALUE_FUNCTIONS, Baseline
+from metrpo.policy.value.value_table import VALUE_FUNCTIONS, Baseline
 from metrpo.types import Array, SampleActions, Trajectories
 from metrpo.world.task import Task
 

@@ -49,7 +49,7 @@ METHODS = {
 }
 """Modules with `init` and `step`; imported when used, for some need libraries of their own."""
 _LIMITED = ("model-based", "trpo")
-"""Methods whose real steps are all played by `world.collect` and learned from as they were executed."""
+"""Methods whose real steps are all played by `world.collection` and learned from as they were executed."""
 
 
 def init(config: Config) -> Saved:

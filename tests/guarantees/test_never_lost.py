@@ -32,7 +32,7 @@ from metrpo.run.directory import RunDirectory
 from metrpo.run.metrics import read_metrics
 from metrpo.stages import records
 from metrpo.training import train
-from metrpo.world import collect as real
+from metrpo.world import collection as real
 from metrpo.world import dataset as datasets
 from metrpo.world import registry
 from metrpo.world.task import Task

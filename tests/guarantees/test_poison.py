@@ -21,11 +21,11 @@ from metrpo.console.progress import SILENT
 from metrpo.errors import DivergedError, TaskError
 from metrpo.model import fit as fitting
 from metrpo.model.imagine import ImagineInfo, Simulator, imagine, returns_per_model
+from metrpo.policy.improvers.improver_table import IMPROVERS, init_memory
 from metrpo.policy.improvers.settings import PhaseSettings
-from metrpo.policy.improvers.table import IMPROVERS, init_memory
 from metrpo.policy.stopping import RULES, Evidence
 from metrpo.policy.value import linear
-from metrpo.policy.value.table import init_baseline
+from metrpo.policy.value.value_table import init_baseline
 from metrpo.presets import override
 from metrpo.run import directory
 from metrpo.run.clock import Clock
@@ -33,7 +33,7 @@ from metrpo.run.metrics import completed, read_metrics
 from metrpo.stages import ensemble_fit, policy_search, records
 from metrpo.training import train
 from metrpo.types import Trajectories
-from metrpo.world import collect as real
+from metrpo.world import collection as real
 from metrpo.world.env_wrapper import Guarded
 
 POISON = [math.nan, math.inf, -math.inf]

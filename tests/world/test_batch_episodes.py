@@ -16,7 +16,7 @@ from helpers import random_policy
 from metrpo.baselines import on_policy
 from metrpo.errors import DivergedError, EpisodeError, TaskError
 from metrpo.policy import gaussian
-from metrpo.world import batch_episodes, collect
+from metrpo.world import batch_episodes, collection
 from metrpo.world.registry import get_task
 from metrpo.world.tasks.rllab.environment import MujocoTask
 
@@ -58,7 +58,7 @@ def test_side_by_side_is_the_environment_step_by_step(name):
 
 
 def one_after_another(task, seeds, at_least, longest=None):
-    """The same by `collect.play`, whose generators give the seeds."""
+    """The same by `collection.play`, whose generators give the seeds."""
 
     class Given:
         def __init__(self, seed):
@@ -73,7 +73,7 @@ def one_after_another(task, seeds, at_least, longest=None):
         number, steps = np.array([len(episodes)]), itertools.count()
         return lambda state: noise(state[None], number, np.array([next(steps)]))[0]
 
-    with contextlib.closing(collect.play(task, draw_act, map(Given, seeds), longest)) as played:
+    with contextlib.closing(collection.play(task, draw_act, map(Given, seeds), longest)) as played:
         while sum(len(e.rewards) for e in episodes) < at_least:
             episodes.append(next(played))
     return episodes
@@ -116,7 +116,7 @@ def test_drawn_episodes_do_not_depend_on_how_many_run_at_a_time(monkeypatch):
 def test_returns_are_those_of_the_plain_evaluation(name):
     task = get_task(name)
     act = partial(gaussian.mean, random_policy(1, task.state_size, task.action_size))
-    expected = collect.evaluate(task, act, 5, seed=4)
+    expected = collection.evaluate(task, act, 5, seed=4)
     np.testing.assert_array_equal(batch_episodes.evaluate(task, act, 5, seed=4), expected)
     assert len(set(expected)) == 5
 
@@ -127,7 +127,7 @@ def test_any_other_environment_is_played_one_after_another():
         assert not batch_episodes.applies(task)
     for task in (probe.PROBE, probe.ENDING_PROBE):
         np.testing.assert_array_equal(
-            batch_episodes.evaluate(task, act, 6, seed=4), collect.evaluate(task, act, 6, seed=4)
+            batch_episodes.evaluate(task, act, 6, seed=4), collection.evaluate(task, act, 6, seed=4)
         )
 
 
@@ -137,10 +137,10 @@ def test_steps_are_told_and_the_evaluation_has_its_bound():
     assert told == [*range(3, 301, 3)]
     act = partial(gaussian.mean, random_policy(1, task.state_size, task.action_size))
     np.testing.assert_array_equal(
-        batch_episodes.evaluate(task, act, 9, 4, at_most=350), collect.evaluate(task, act, 9, 4, at_most=350)
+        batch_episodes.evaluate(task, act, 9, 4, at_most=350), collection.evaluate(task, act, 9, 4, at_most=350)
     )
     short = batch_episodes.evaluate(task, act, 3, 4, longest=5)
-    np.testing.assert_array_equal(short, collect.evaluate(task, act, 3, 4, longest=5))
+    np.testing.assert_array_equal(short, collection.evaluate(task, act, 3, 4, longest=5))
     assert not np.array_equal(short, batch_episodes.evaluate(task, act, 3, 4))
 
 

@@ -18,7 +18,7 @@ from metrpo import evaluation
 from metrpo.errors import TaskError
 from metrpo.run.policy_file import LoadedPolicy, PolicyInfo
 from metrpo.run.video import VideoError
-from metrpo.world import collect as real
+from metrpo.world import collection as real
 from metrpo.world import registry
 from metrpo.world.env_wrapper import Guarded
 from metrpo.world.resolve import task_of

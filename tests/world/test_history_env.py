@@ -12,7 +12,7 @@ import late
 import probe
 from metrpo.errors import EpisodeError, NotFiniteError, TaskError
 from metrpo.limits import Limits
-from metrpo.world import collect
+from metrpo.world import collection
 from metrpo.world.formula_check import check_formulas
 from metrpo.world.history_env import with_history
 from metrpo.world.registry import get_task, limited
@@ -23,7 +23,7 @@ SEEN = with_history(late.LATE, 3)
 def test_states_hold_the_actions_as_they_were_executed():
     task = with_history(limited(late.LATE, Limits(0.6, 0.25)), 3)
     loud = lambda rng: lambda state: 9 * rng.standard_normal(2)  # noqa: E731
-    for episode in collect.collect(task, loud, 60, np.random.default_rng(0)):
+    for episode in collection.collect(task, loud, 60, np.random.default_rng(0)):
         states, actions = episode.states, episode.actions
         assert np.abs(actions).max() <= np.float32(0.6)
         np.testing.assert_array_equal(states[0], [*states[0, :2]] * 3 + [0.0] * 4)
@@ -74,7 +74,7 @@ def test_a_task_of_ours_with_a_history_is_its_environment():
     swimmer = with_history(get_task("Swimmer"), 2)
     act = lambda state: 0.5 * np.tanh(state[:2])  # noqa: E731
     np.testing.assert_array_equal(
-        collect.evaluate(swimmer, act, 1, seed=0), collect.evaluate(get_task("Swimmer"), act, 1, seed=0)
+        collection.evaluate(swimmer, act, 1, seed=0), collection.evaluate(get_task("Swimmer"), act, 1, seed=0)
     )
 
 
@@ -105,7 +105,7 @@ class Broken(gymnasium.Wrapper):
 def test_an_observation_of_another_shape_is_named_as_such(given, said):
     task = broken_task(given)
     with pytest.raises(EpisodeError, match=f"Late: step\\(\\): {said}"):
-        collect.evaluate(task, lambda s: np.zeros(2), 1, 0)
+        collection.evaluate(task, lambda s: np.zeros(2), 1, 0)
 
 
 def broken_task(given):
@@ -115,10 +115,10 @@ def broken_task(given):
 
 def test_what_is_not_finite_and_what_is_no_step_are_refused_as_ever():
     with pytest.raises(NotFiniteError, match="Late: step 0 of an episode: expected finite numbers"):
-        collect.evaluate(broken_task(np.array([0.0, np.nan])), lambda s: np.zeros(2), 1, 0)
+        collection.evaluate(broken_task(np.array([0.0, np.nan])), lambda s: np.zeros(2), 1, 0)
     task = dataclasses.replace(late.LATE, make=lambda **kw: Quiet(late.LATE.make_env(**kw)))
     with pytest.raises(TaskError, match=r"Late: reset\(\): expected \(observation, info\), got"):
-        collect.evaluate(with_history(task, 2), lambda s: np.zeros(2), 1, 0)
+        collection.evaluate(with_history(task, 2), lambda s: np.zeros(2), 1, 0)
 
 
 class Quiet(gymnasium.Wrapper):

@@ -13,7 +13,7 @@ from metrpo.config import Config
 from metrpo.errors import ConfigError, TaskError
 from metrpo.presets import override
 from metrpo.stages import records
-from metrpo.world import collect as real
+from metrpo.world import collection as real
 from metrpo.world import offline_data
 
 pytestmark = pytest.mark.usefixtures("plain_curve")

@@ -19,7 +19,7 @@ from metrpo.errors import ConfigError, TaskError
 from metrpo.model.imagine import Simulator, imagine, outcome, returns_per_model
 from metrpo.model.sampling import SAMPLINGS
 from metrpo.presets import override, preset
-from metrpo.world import collect as real
+from metrpo.world import collection as real
 from metrpo.world import dataset as datasets
 from metrpo.world import registry, resolve
 from metrpo.world.env_wrapper import Guarded

@@ -42,7 +42,7 @@ def test_doing_nothing_earns_what_a_loop_says():
 def test_long_episodes_are_played_less_often(monkeypatch, horizon, episodes):
     seen = []
     monkeypatch.setattr(
-        world.collect, "evaluate", lambda t, act, n, seed, longest: seen.append((n, longest)) or np.zeros(n)
+        world.collection, "evaluate", lambda t, act, n, seed, longest: seen.append((n, longest)) or np.zeros(n)
     )
     world.measure(dataclasses.replace(probe.PROBE, horizon=horizon))
     assert seen == 2 * [(episodes, 10_000)]

@@ -13,8 +13,8 @@ from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.types import Episode
 from metrpo.world import batch_episodes
-from metrpo.world import collect as real
-from metrpo.world.collect import seed_of
+from metrpo.world import collection as real
+from metrpo.world.collection import seed_of
 from metrpo.world.task import Task
 
 
@@ -35,7 +35,7 @@ def collect(
     longest: int | None = None,
     at_most: float = math.inf,
 ) -> Drawn:
-    """Whole episodes of `at_least` steps together, acting by samples of `policy` (see `world.collect.collect`).
+    """Whole episodes of `at_least` steps together, acting by samples of `policy` (see `world.collection.collect`).
 
     The paper's tasks are played many episodes at a time (`world.batch_episodes`), each with noise of its own.
     No step is played beyond `at_most` of all together.

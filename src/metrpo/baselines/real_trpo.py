@@ -20,8 +20,8 @@ from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers import trpo
 from metrpo.policy.improvers.batch import ImproveInfo
-from metrpo.policy.improvers.table import batch_of
-from metrpo.policy.value.table import Baseline, init_baseline
+from metrpo.policy.improvers.improver_table import batch_of
+from metrpo.policy.value.value_table import Baseline, init_baseline
 from metrpo.run.clock import Clock
 from metrpo.run.metrics import Row
 from metrpo.seeds import Stage, key_of, rng_of

@@ -27,7 +27,7 @@ class Export:
 
 def run(command: Export) -> int:
     """Returns the exit code."""
-    from metrpo.run.export import export
+    from metrpo.run.policy_export import export
 
     print(export(command.dir, command.out))
     return 0

@@ -35,7 +35,7 @@ class Push:
 def run(command: Push) -> int:
     """Returns the exit code."""
     from metrpo.run.files import atomic_write
-    from metrpo.run.push import CARD, owner_of_token, parcel, send
+    from metrpo.run.hub_upload import CARD, owner_of_token, parcel, send
 
     if command.dry_run:
         made = parcel(command.dir, command.repo)

@@ -32,7 +32,7 @@ class Zoo:
 
 def run(command: Zoo) -> int:
     """Returns the exit code."""
-    from metrpo import zoo
+    from metrpo import policy_zoo as zoo
 
     cards = [zoo.card(name) for name in ([command.name] if command.name else zoo.names())]
     if command.json:

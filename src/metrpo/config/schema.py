@@ -328,7 +328,7 @@ Method = Literal["model-based", "trpo", "ppo", "ddpg", "svg"]
 """The loops: in the ensemble, or a baseline in the real environment."""
 
 ImproverName = Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic"]
-"""The rows of `metrpo.policy.improvers.table.IMPROVERS`."""
+"""The rows of `metrpo.policy.improvers.improver_table.IMPROVERS`."""
 
 Preset = Literal["fast", "paper", "long-horizon"]
 """Names of the presets (see `metrpo.presets`)."""

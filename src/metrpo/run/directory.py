@@ -21,7 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar
 
 import jax
 import numpy as np
@@ -48,8 +48,11 @@ from metrpo.run.metrics import (
     to_csv,
     without_clocks,
 )
-from metrpo.run.policy_file import Interface, Learned, Weights, save_policy
+from metrpo.run.policy_file import Learned, Weights, save_policy
 from metrpo.safe_load import text_of
+
+if TYPE_CHECKING:  # importing a run directory imports no environment
+    from metrpo.world.interface import Interface
 
 _log = logging.getLogger("metrpo")
 _KEPT = 2

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -16,9 +16,12 @@ from metrpo.config import Config
 from metrpo.errors import RunDirectoryError
 from metrpo.history import History
 from metrpo.limits import Limits
+from metrpo.policy_zoo import located
 from metrpo.run.files import FORMAT, atomic_write, inside, metrpo_version, read_arrays, write_arrays
 from metrpo.safe_load import brief
-from metrpo.zoo import located
+
+if TYPE_CHECKING:  # loading a policy imports no environment
+    from metrpo.world.interface import Interface
 
 FILE = "policy.npz"
 
@@ -87,22 +90,6 @@ class Learned(NamedTuple):
     """Real steps that it had learned from."""
     return_real: float | None
     """Mean real return of the policy without noise; None: not known."""
-
-
-class Interface(Protocol):
-    """What a task's environment shows and takes (`metrpo.world.interface.Interface`)."""
-
-    @property
-    def observation(self) -> tuple[tuple[int, str], ...]:
-        """The parts of an observation, in order: how many numbers, and what they are."""
-
-    @property
-    def action_low(self) -> tuple[float, ...]:
-        """[A]"""
-
-    @property
-    def action_high(self) -> tuple[float, ...]:
-        """[A]"""
 
 
 class Weights(Protocol):

@@ -29,7 +29,7 @@ from metrpo.policy.improvers.batch import Batch
 from metrpo.policy.value import linear
 from metrpo.presets import override, preset
 from metrpo.types import Array, Trajectories, Transitions
-from metrpo.world import collect as real
+from metrpo.world import collection as real
 from metrpo.world.registry import get_task
 from metrpo.world.task import Task
 

@@ -14,13 +14,13 @@ from metrpo.finite import naming
 from metrpo.model.ensemble import Ensemble
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
-from metrpo.policy.value.table import Baseline
+from metrpo.policy.value.value_table import Baseline
 from metrpo.policy_phase import Hooks, PhaseInfo, Starts, simulator_of
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.stages.records import recorded_returns
 from metrpo.stages.state import State, inputs_for
-from metrpo.world import collect as real
+from metrpo.world import collection as real
 from metrpo.world.dataset import Dataset
 from metrpo.world.origin import relative, shifted
 from metrpo.world.task import Task

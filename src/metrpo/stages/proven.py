@@ -26,7 +26,7 @@ from metrpo.seeds import Stage, rng_of
 from metrpo.stages.log import Log
 from metrpo.stages.state import Proven, State, on_host
 from metrpo.types import Episode
-from metrpo.world import collect as real
+from metrpo.world import collection as real
 from metrpo.world import dataset as datasets
 from metrpo.world.origin import of_real
 from metrpo.world.task import Task

@@ -23,7 +23,7 @@ from metrpo.seeds import Stage, rng_of
 from metrpo.stages.log import Log, Unkept, left_out
 from metrpo.stages.state import State, inputs_for, on_host
 from metrpo.types import Episode
-from metrpo.world import collect as real
+from metrpo.world import collection as real
 from metrpo.world.origin import of_real
 from metrpo.world.task import Task
 

@@ -27,7 +27,7 @@ from metrpo.stages.proven import Verdict
 from metrpo.stages.state import State, on_host
 from metrpo.types import Episode
 from metrpo.world import batch_episodes
-from metrpo.world.collect import Act
+from metrpo.world.collection import Act
 from metrpo.world.dataset import Dataset
 from metrpo.world.origin import of_real
 from metrpo.world.size_limits import RECORDED

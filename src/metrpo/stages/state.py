@@ -11,7 +11,7 @@ from metrpo.config import Config
 from metrpo.model.ensemble import Networks
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.inputs import Inputs, inputs_of
-from metrpo.policy.value.table import Baseline
+from metrpo.policy.value.value_table import Baseline
 from metrpo.world.dataset import Dataset
 from metrpo.world.task import Task
 

@@ -1,8 +1,8 @@
 """Many real episodes at a time: one call of the policy for all of them, and threads for the physics.
 
-For the paper's tasks; others are played one after another (`metrpo.world.collect`). The episodes are the same: each has
-its own seed, the physics of each its own memory (the solver's warm start included), and which episodes are played does
-not depend on how many run at a time.
+For the paper's tasks; others are played one after another (`metrpo.world.collection`). The episodes are the same: each
+has its own seed, the physics of each its own memory (the solver's warm start included), and which episodes are played
+does not depend on how many run at a time.
 
 `mujoco.rollout` would not do with a policy in the loop: it hands out neither the solver's warm start, without which the
 next call computes other contacts, nor the centre of mass after a step, but before it.
@@ -21,7 +21,7 @@ import numpy as np
 
 from metrpo.errors import EpisodeError
 from metrpo.types import Episode
-from metrpo.world import collect
+from metrpo.world import collection
 from metrpo.world.task import Task
 from metrpo.world.tasks.rllab.bodies import is_robot
 from metrpo.world.tasks.rllab.environment import MujocoTask
@@ -162,7 +162,7 @@ def _advance(task: Task, slots: SideBySide, running: dict[int, _Running], act: A
     actions = act(np.array([r.states[-1] for r in now]), np.array([r.number for r in now]), steps)
     if actions.shape != (len(now), task.action_size) or np.isnan(actions).any():
         for action, step in zip(actions, steps, strict=True):
-            collect.action_of(task, action, f"step {step} of an episode")  # raises
+            collection.action_of(task, action, f"step {step} of an episode")  # raises
     actions = task.limits.within(actions, _before(task, now)).astype(np.float32)
     got = slots.step(order, actions, steps)
     for i, r in enumerate(now):
@@ -181,13 +181,13 @@ def _before(task: Task, now: list[_Running]) -> np.ndarray | None:
 
 
 def evaluate(
-    task: Task, act: collect.Act, episodes: int, seed: int, at_most: int | None = None, longest: int | None = None
+    task: Task, act: collection.Act, episodes: int, seed: int, at_most: int | None = None, longest: int | None = None
 ) -> np.ndarray:
-    """`collect.evaluate` for an `act` that takes many states at once, [n, S] -> [n, A]: the same returns, sooner."""
+    """`collection.evaluate` for an `act` that takes many states at once, [n, S] -> [n, A]: the same returns, sooner."""
     if not applies(task):
-        return collect.evaluate(task, act, episodes, seed, at_most, longest)
+        return collection.evaluate(task, act, episodes, seed, at_most, longest)
     rng = np.random.default_rng(seed)
-    seeds = (collect.seed_of(rng) for _ in range(episodes))
+    seeds = (collection.seed_of(rng) for _ in range(episodes))
     played = play(task, lambda states, numbers, steps: act(states), seeds, at_most or math.inf, longest)
     return np.array([e.rewards.sum(dtype=np.float64) for e in played])
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from metrpo.errors import TaskError
 from metrpo.types import Episode
-from metrpo.world import collect as real
+from metrpo.world import collection as real
 from metrpo.world.task import Task
 
 STEPS = 1000

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from metrpo.world import collect
-from metrpo.world.collect import Act
+from metrpo.world import collection
+from metrpo.world.collection import Act
 from metrpo.world.size_limits import RECORDED
 from metrpo.world.task import Task
 
@@ -62,7 +62,7 @@ def measure(task: Task, episodes: int | None = None, seed: int = 0) -> Yardstick
 
 
 def _measured(task: Task, act: Act, episodes: int, seed: int) -> Yardstick:
-    returns = collect.evaluate(task, act, episodes, seed, longest=RECORDED)
+    returns = collection.evaluate(task, act, episodes, seed, longest=RECORDED)
     return Yardstick(float(np.mean(returns)), float(np.std(returns)), episodes)
 
 

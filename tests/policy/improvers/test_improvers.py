@@ -20,8 +20,8 @@ from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers import bptt, ppo, vpg
 from metrpo.policy.improvers.adam import ascend, init_moments
 from metrpo.policy.improvers.batch import Batch
+from metrpo.policy.improvers.improver_table import IMPROVERS, init_memory
 from metrpo.policy.improvers.settings import PhaseSettings
-from metrpo.policy.improvers.table import IMPROVERS, init_memory
 from metrpo.policy.value import linear
 from metrpo.presets import override
 

@@ -16,10 +16,10 @@ from helpers import linear_ensemble, on_host, random_policy
 from metrpo import devices, policy_phase, training
 from metrpo.config import AdvantageConfig, Config
 from metrpo.policy import advantage
+from metrpo.policy.improvers.improver_table import batch_of, init_memory
 from metrpo.policy.improvers.settings import PhaseSettings
-from metrpo.policy.improvers.table import batch_of, init_memory
 from metrpo.policy.value import linear, network
-from metrpo.policy.value.table import VALUE_FUNCTIONS, init_baseline
+from metrpo.policy.value.value_table import VALUE_FUNCTIONS, init_baseline
 from metrpo.presets import override
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.types import Trajectories

@@ -8,7 +8,7 @@ import pytest
 
 import metrpo
 from helpers import random_policy
-from metrpo import zoo
+from metrpo import policy_zoo as zoo
 from metrpo.commands import main
 from metrpo.config import Config
 from metrpo.errors import RunDirectoryError

@@ -16,8 +16,8 @@ from metrpo.config import Config
 from metrpo.errors import MetrpoError, RunDirectoryError, TaskError
 from metrpo.evaluation import evaluate, render
 from metrpo.hub import repository
+from metrpo.run.hub_upload import parcel
 from metrpo.run.policy_file import Learned, save_policy
-from metrpo.run.push import parcel
 from metrpo.world.registry import get_task
 from seen_runs import a_run
 
@@ -180,20 +180,20 @@ def test_a_policy_of_the_hub_runs_no_code_that_its_author_names(tmp_path, monkey
     (tmp_path / "imported.py").write_text("import pathlib; pathlib.Path('ran').touch()")
     monkeypatch.syspath_prepend(tmp_path)
     there = tmp_path / "there"
-    monkeypatch.setattr("metrpo.zoo.downloaded", lambda place: there)
+    monkeypatch.setattr("metrpo.policy_zoo.downloaded", lambda place: there)
     a_finished_run(there, dataclasses.replace(CONFIG, task="mine.py:task", imports=("imported",)))
     for use in (evaluate, render):
         with pytest.raises(TaskError, match="a name from elsewhere runs no code here; say what to play: --task"):
             use("hub:me/x")
     task = get_task("Swimmer")
-    monkeypatch.setattr("metrpo.world.collect.evaluate", lambda known, *_: np.array([float(known.horizon)]))
+    monkeypatch.setattr("metrpo.world.collection.evaluate", lambda known, *_: np.array([float(known.horizon)]))
     assert evaluate("hub:me/x", task="Swimmer").mean == task.horizon
     recorded = []
     monkeypatch.setattr("metrpo.evaluation.record", lambda make, policy, out, seed: recorded.append(str(out)) or out)
     render("hub:me/x", task="Swimmer")
     assert recorded == ["x.mp4"], "nothing is written into the cache"
     with pytest.raises(MetrpoError, match="hub:me/x: expected where to write it"):
-        metrpo.run.export.export("hub:me/x")
+        metrpo.run.policy_export.export("hub:me/x")
     assert not (tmp_path / "ran").exists()
     with pytest.raises(RunDirectoryError, match="expected the directory of a run of yours"):
         parcel("hub:me/x", None)

@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 from helpers import random_policy
 from metrpo.errors import MetrpoError, RunDirectoryError
 from metrpo.policy import gaussian
-from metrpo.run.export import export
 from metrpo.run.files import read_arrays, write_arrays
+from metrpo.run.policy_export import export
 from metrpo.run.policy_file import Learned, PolicyInfo, load_policy, save_policy
 from metrpo.world.interface import Interface
 from metrpo.world.registry import get_task

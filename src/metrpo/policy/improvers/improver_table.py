@@ -21,7 +21,7 @@ from metrpo.policy.improvers import bptt, ppo, trpo, vpg
 from metrpo.policy.improvers.adam import init_moments
 from metrpo.policy.improvers.batch import Batch, ImproveInfo
 from metrpo.policy.improvers.settings import PhaseSettings
-from metrpo.policy.value.table import VALUE_FUNCTIONS, Baseline
+from metrpo.policy.value.value_table import VALUE_FUNCTIONS, Baseline
 from metrpo.types import Array, SampleActions, Simulate, Trajectories
 
 

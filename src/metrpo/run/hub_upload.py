@@ -9,11 +9,11 @@ from tempfile import TemporaryDirectory
 
 from metrpo.errors import MetrpoError, RunDirectoryError
 from metrpo.hub import asked, library, repository
+from metrpo.policy_zoo import is_name
 from metrpo.run.card import model_card, task_name
-from metrpo.run.export import export
 from metrpo.run.find import SeenRun, is_finished, read
+from metrpo.run.policy_export import export
 from metrpo.run.policy_file import FILE
-from metrpo.zoo import is_name
 
 CARD = "model_card.md"
 """In the run directory; on the hub it is README.md."""

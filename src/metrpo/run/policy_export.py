@@ -22,10 +22,10 @@ import numpy as np
 from metrpo.errors import MetrpoError, RunDirectoryError
 from metrpo.history import History
 from metrpo.limits import Limits
+from metrpo.policy_zoo import is_name, located
 from metrpo.run.files import atomic_write, metrpo_version
 from metrpo.run.policy_file import FILE, LoadedPolicy, load_policy, with_interface
 from metrpo.safe_load import opened
-from metrpo.zoo import is_name, located
 
 _Writer = Callable[[LoadedPolicy, Path], bytes | str]
 _IMPORTED = ("base64", "hashlib", "numpy")

@@ -8,7 +8,7 @@ from scipy import stats
 
 import probe
 from metrpo.config import CollectConfig
-from metrpo.world import collect as real
+from metrpo.world import collection as real
 from metrpo.world import env_returns
 
 ZERO = lambda state: np.zeros(2)  # noqa: E731
