@@ -192,14 +192,14 @@ def _loop(
             written = save(state, row)
             callbacks.on_iteration(written)
             seconds.append(time.monotonic() - started)
-            progress.end(written, _seconds_left(seconds, _iterations_left(config, state)))
+            progress.end(written, seconds_left(seconds, _iterations_left(config, state)))
     finally:
         progress.close()
         callbacks.on_end()
     return state
 
 
-def _seconds_left(seconds: Sequence[float], iterations: int | None) -> float | None:
+def seconds_left(seconds: Sequence[float], iterations: int | None) -> float | None:
     """About how long so many iterations take, by the last three: they grow with the data. The first one compiled."""
     if iterations == 0:
         return 0.0

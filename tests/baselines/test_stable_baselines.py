@@ -96,8 +96,8 @@ def test_the_networks_and_adam_change_and_are_kept(runs, method):
 @METHODS
 def test_the_state_goes_into_the_library_and_comes_out_again(runs, method):
     config, state = override(TINY, {"method": method}), runs[method][0][3]
-    env = stable_baselines._environment(probe.PROBE)
-    assert equal(stable_baselines._state(config, stable_baselines._model(config, env, 0, state), 3), state)
+    env = stable_baselines.training_env(probe.PROBE)
+    assert equal(stable_baselines.state_of(config, stable_baselines.new_model(config, env, 0, state), 3), state)
     env.close()
 
 
@@ -155,8 +155,8 @@ def test_the_seed_decides_the_whole_run(runs, method):
 def test_the_exported_policy_acts_as_stable_baselines3_predicts(runs, method, tmp_path):
     config, state = override(TINY, {"method": method}), runs[method][0][3]
     states = np.random.default_rng(0).normal(scale=3.0, size=(1000, 2)).astype(np.float32)
-    env = stable_baselines._environment(probe.PROBE)
-    expected, _ = stable_baselines._model(config, env, 0, state).predict(states, deterministic=True)
+    env = stable_baselines.training_env(probe.PROBE)
+    expected, _ = stable_baselines.new_model(config, env, 0, state).predict(states, deterministic=True)
     env.close()
     np.testing.assert_allclose(np.clip(gaussian.mean(state.policy, states), -1, 1), expected, atol=1e-5)
     save_policy(tmp_path, state.policy, "Probe", Learned(3, state.real_steps, None))
@@ -295,7 +295,7 @@ def test_statistics_are_running_ones_and_fold_into_a_layer():
 def test_networks_see_observations_by_their_statistics(runs, method):
     """Another unit and another zero of the observations, taken in by the statistics, change nothing."""
     config, state = override(TINY, {"method": method}), runs[method][0][3]
-    env, scale, shift = stable_baselines._environment(probe.PROBE), np.array([50.0, 4.0]), np.array([300.0, -20.0])
+    env, scale, shift = stable_baselines.training_env(probe.PROBE), np.array([50.0, 4.0]), np.array([300.0, -20.0])
     n = state.statistics["count"]
     moved = state._replace(
         statistics={
@@ -307,8 +307,8 @@ def test_networks_see_observations_by_their_statistics(runs, method):
         }
     )
     states = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
-    expected, _ = stable_baselines._model(config, env, 0, state).predict(states, deterministic=True)
-    got, _ = stable_baselines._model(config, env, 0, moved).predict(
+    expected, _ = stable_baselines.new_model(config, env, 0, state).predict(states, deterministic=True)
+    got, _ = stable_baselines.new_model(config, env, 0, moved).predict(
         (states * scale + shift).astype(np.float32), deterministic=True
     )
     env.close()
@@ -337,8 +337,8 @@ def test_the_critic_normalises_layers_and_takes_actions_second():
 
 def test_l2_pulls_on_the_critics_hidden_weights_alone(runs):
     config, state = override(TINY, {"method": "ddpg"}), runs["ddpg"][0][3]
-    env = stable_baselines._environment(probe.PROBE)
-    model = stable_baselines._model(config, env, 0, state)
+    env = stable_baselines.training_env(probe.PROBE)
+    model = stable_baselines.new_model(config, env, 0, state)
     env.close()
     critic = model.critic
     for memory in critic.optimizer.state.values():
@@ -405,8 +405,8 @@ def test_the_curve_can_be_drawn_without_the_models_columns(runs, tmp_path):
 @METHODS
 def test_the_algorithm_has_the_settings_named(method):
     config = override(TINY, {"method": method})
-    env = stable_baselines._environment(probe.PROBE)
-    model = stable_baselines._model(config, env, stable_baselines._seed(config, 0, Stage.INIT), None)
+    env = stable_baselines.training_env(probe.PROBE)
+    model = stable_baselines.new_model(config, env, stable_baselines._seed(config, 0, Stage.INIT), None)
     env.close()
     sizes = {name: tuple(x.shape) for name, x in model.policy.named_parameters() if name.endswith("weight")}
     if method == "ppo":

@@ -498,7 +498,7 @@ def test_the_environment_is_ready_before_jax(monkeypatch, tmp_path):
     for name in ("JAX_PLATFORMS", "XLA_FLAGS", "NPROC", "JAX_COMPILATION_CACHE_DIR"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(machine, "_may_have_gpu", lambda: False)
+    monkeypatch.setattr(machine, "may_have_gpu", lambda: False)
     machine.set_variables(None, deterministic=False)
     assert os.environ["JAX_PLATFORMS"] == "cpu"
     assert os.environ["JAX_COMPILATION_CACHE_DIR"] == str(tmp_path / "metrpo" / "jax")
@@ -536,9 +536,9 @@ def test_a_gpu_multiplies_in_float32_unless_told_otherwise(monkeypatch, tmp_path
 def test_either_cuda_plugin_is_a_gpu_that_jax_may_use(monkeypatch, cuda):
     monkeypatch.setattr(machine, "has_nvidia", lambda: True)
     monkeypatch.setattr(machine, "find_spec", lambda name: name == f"jax_cuda{cuda}_plugin" or None)
-    assert machine._may_have_gpu()
+    assert machine.may_have_gpu()
     monkeypatch.setattr(machine, "has_nvidia", lambda: False)
-    assert not machine._may_have_gpu() or os.path.exists("/dev/kfd") or sys.platform != "linux"
+    assert not machine.may_have_gpu() or os.path.exists("/dev/kfd") or sys.platform != "linux"
 
 
 def test_deterministic_leaves_xla_one_thread():
@@ -602,7 +602,7 @@ def test_the_cpu_that_is_asked_for_wins_over_the_users_variable():
 def test_any_cuda_plugin_is_a_gpu_that_may_be_there(monkeypatch):
     monkeypatch.setattr(machine, "has_nvidia", lambda: True)
     monkeypatch.setattr(machine, "find_spec", lambda name: name if name == "jax_cuda13_plugin" else None)
-    assert machine._may_have_gpu()
+    assert machine.may_have_gpu()
 
 
 STOPPED = """

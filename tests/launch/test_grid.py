@@ -61,8 +61,8 @@ def test_a_long_combination_has_a_folder_name_every_disk_takes(tmp_path):
     assert len(set(folders)) == 2, "what is cut off still counts"
     for run in runs:
         (tmp_path / run.name).mkdir(parents=True)
-    assert grid._variant("k-1", (("a", "é" * 124 + "b"),)) == "k-1,a=" + "é" * 124 + "b", "255 bytes"
-    assert grid._variant("k-10", (("a", "é" * 125),)).startswith("k-10,a=" + "é" * 86 + ","), "no half letters"
+    assert grid.variant_name("k-1", (("a", "é" * 124 + "b"),)) == "k-1,a=" + "é" * 124 + "b", "255 bytes"
+    assert grid.variant_name("k-10", (("a", "é" * 125),)).startswith("k-10,a=" + "é" * 86 + ","), "no half letters"
 
 
 def test_what_is_run_is_what_the_grid_says(monkeypatch):

@@ -23,7 +23,7 @@ NAME = "XLA_PYTHON_CLIENT_MEM_FRACTION"
     ],
 )
 def test_each_run_gets_its_part_of_the_gpu(monkeypatch, tmp_path, there, platforms, user, jobs, share):
-    monkeypatch.setattr(machine, "_may_have_gpu", lambda: there)
+    monkeypatch.setattr(machine, "may_have_gpu", lambda: there)
     monkeypatch.setenv("JAX_PLATFORMS", platforms)
     monkeypatch.setenv(NAME, user or "")
     if user is None:

@@ -298,11 +298,11 @@ def test_a_curve_from_before_the_checkpoint_is_drawn_anew(tmp_path, monkeypatch)
 
 
 def test_the_time_left_does_not_count_the_compilation():
-    assert training._seconds_left([60.0], 9) is None
-    assert training._seconds_left([60.0, 2.0], 9) == 18
-    assert training._seconds_left([60.0, 2.0, 3.0, 4.0, 5.0], 2) == 8
-    assert training._seconds_left([60.0], 0) == 0
-    assert training._seconds_left([60.0, 2.0], None) is None
+    assert training.seconds_left([60.0], 9) is None
+    assert training.seconds_left([60.0, 2.0], 9) == 18
+    assert training.seconds_left([60.0, 2.0, 3.0, 4.0, 5.0], 2) == 8
+    assert training.seconds_left([60.0], 0) == 0
+    assert training.seconds_left([60.0, 2.0], None) is None
 
 
 def test_the_budget_may_change(tmp_path):

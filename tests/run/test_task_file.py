@@ -48,7 +48,7 @@ def _as_before(monkeypatch, tmp_path):
     yield
     for name in set(sys.modules) - before:
         del sys.modules[name]
-    resolve._resolve.cache_clear()
+    resolve.resolved.cache_clear()
 
 
 def write(path, text, **fields):
@@ -154,7 +154,7 @@ def forgotten(monkeypatch, *names):
     """As in a new process."""
     monkeypatch.setattr(resolve, "_PLACES", {})
     monkeypatch.setattr(sys, "path", [place for place in sys.path if "/pytest-" not in place])
-    resolve._resolve.cache_clear()
+    resolve.resolved.cache_clear()
     for name in names:
         del sys.modules[name]
 
@@ -214,7 +214,7 @@ def test_every_command_that_plays_or_learns_takes_the_place_anew(command, monkey
     a_run(Path("run"), "mine.py:make")
     Path("run/config.json").write_text(to_json(preset("mine.py:make")))
     Path("mine.py").rename("there/moved.py")
-    resolve._resolve.cache_clear()
+    resolve.resolved.cache_clear()
     monkeypatch.setattr("metrpo.run.machine.prepare", lambda *_, **__: None)
     made = []
     monkeypatch.setattr(resolve, "task_of", lambda make, *_, **__: made.append(make.__module__) or raising())

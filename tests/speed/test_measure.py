@@ -12,17 +12,17 @@ from metrpo.speed import measure, ours, peers
 
 
 def test_operations_are_those_of_the_layers():
-    assert ours._operations("1024") == 2 * (24 * 1024 + 1024 * 1024 + 1024 * 18)
-    assert ours._operations("200x4") == 2 * (24 * 200 + 3 * 200 * 200 + 200 * 18)
+    assert ours.operations("1024") == 2 * (24 * 1024 + 1024 * 1024 + 1024 * 18)
+    assert ours.operations("200x4") == 2 * (24 * 200 + 3 * 200 * 200 + 200 * 18)
 
 
 def test_every_work_of_a_peer_has_a_counterpart():
     works = ours.works()
     for offered in peers.WORK.values():
         for theirs in offered:
-            assert measure._counterpart(theirs, works) in works
-    assert measure._counterpart("fit-1024-bfloat16", works) == "fit-1024-bfloat16"
-    assert measure._counterpart("trpo-value", works) == "trpo"
+            assert measure.counterpart(theirs, works) in works
+    assert measure.counterpart("fit-1024-bfloat16", works) == "fit-1024-bfloat16"
+    assert measure.counterpart("trpo-value", works) == "trpo"
 
 
 class FakeWorker:

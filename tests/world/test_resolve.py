@@ -138,7 +138,7 @@ def test_a_task_or_an_environment_out_of_a_file(file):
 def test_a_task_out_of_a_module(file, monkeypatch):
     monkeypatch.syspath_prepend(file.rpartition("/")[0])
     assert get_task("mine:task").horizon == 50
-    resolve._resolve.cache_clear()
+    resolve.resolved.cache_clear()
 
 
 @pytest.mark.parametrize(

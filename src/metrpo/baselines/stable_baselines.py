@@ -73,21 +73,21 @@ class SB3State(NamedTuple):
 
 def init(config: Config, task: Task) -> SB3State:
     """The state before the first iteration."""
-    with closing(_environment(task), task.name) as env:
-        return _state(config, _model(config, env, _seed(config, 0, Stage.INIT), None), 0)
+    with closing(training_env(task), task.name) as env:
+        return state_of(config, new_model(config, env, _seed(config, 0, Stage.INIT), None), 0)
 
 
 def step(config: Config, task: Task, state: SB3State, progress: Progress = SILENT) -> tuple[SB3State, Row]:
     """One outer iteration: learning for `collect.steps` real steps, or what is left of the budget, in whole updates."""
     iteration, clock = state.iteration + 1, Clock()
-    with closing(_environment(task), task.name) as env, clock("improve"):
+    with closing(training_env(task), task.name) as env, clock("improve"):
         wanted = budget.steps_wanted(config, state.real_steps)
         progress.stage("learn", wanted)
-        model = _model(config, env, _seed(config, iteration, Stage.COLLECT), state)
+        model = new_model(config, env, _seed(config, iteration, Stage.COLLECT), state)
         watch = _Watch(state.real_steps, clock, progress)
         model.learn(wanted, watch, log_interval=None, reset_num_timesteps=False)
         collected = env.get_episode_rewards()
-        state = _state(config, model, iteration)
+        state = state_of(config, model, iteration)
     with clock("evaluate"):
         progress.stage("evaluate", config.evaluation_episodes)
         returns = recorded_returns(config, task, state.policy, iteration)
@@ -123,7 +123,8 @@ class _Watch(BaseCallback):
         self._progress.update(self.num_timesteps - self._steps_before)
 
 
-def _environment(task: Task) -> Monitor:
+def training_env(task: Task) -> Monitor:
+    """The environment as Stable-Baselines3 plays it, with a record of its episodes."""
     # float32 halves the replay buffer, and is what the networks compute in.
     space = Box(-np.inf, np.inf, (task.state_size,), np.float32)
     return Monitor(ClockEnds(TransformObservation(task.make_env(), lambda state: state.astype(np.float32), space)))
@@ -211,7 +212,7 @@ _REPLAY = ("observations", "next_observations", "actions", "rewards", "dones")
 """The arrays of the replay buffer; the last is 1 where the episode ended."""
 
 
-def _model(config: Config, env: Monitor, seed: int, state: SB3State | None) -> Any:
+def new_model(config: Config, env: Monitor, seed: int, state: SB3State | None) -> Any:
     """The algorithm as `state` left it (None: fresh); all its randomness and the environment's come from `seed`."""
     torch.set_num_threads(1)
     model = _METHODS[config.method][0](config, env, seed, state)
@@ -229,7 +230,8 @@ def _model(config: Config, env: Monitor, seed: int, state: SB3State | None) -> A
     return model
 
 
-def _state(config: Config, model: Any, iteration: int) -> SB3State:
+def state_of(config: Config, model: Any, iteration: int) -> SB3State:
+    """What the next iteration needs of a model."""
     return SB3State(
         iteration=iteration,
         real_steps=model.num_timesteps,

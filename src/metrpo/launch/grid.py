@@ -62,7 +62,7 @@ class Grid:
             overrides = tuple((name, _hashable(value)) for name, value in zip(names, values, strict=True))
             made = dict(overrides)
             task = get_task(given, made.get("env_kwargs", ()), made.get("imports", ())).name
-            variant = _variant(system, overrides)
+            variant = variant_name(system, overrides)
             found.append(RunSpec(task, system, seed, budgets[system] + overrides, self.preset, variant))
         for run in found:
             _ = run.config
@@ -169,7 +169,7 @@ def _hashable(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
-def _variant(system: str, overrides: tuple[tuple[str, Any], ...]) -> str:
+def variant_name(system: str, overrides: tuple[tuple[str, Any], ...]) -> str:
     """The folder of a combination, in words: "me-trpo,ensemble.members=5"; a hash stands for the end of a long one."""
 
     def word(value: Any) -> str:

@@ -47,7 +47,7 @@ def set_variables(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> 
     """What `prepare` sets, without a look at the devices, which imports JAX."""
     if device is not None:
         os.environ["JAX_PLATFORMS"] = {"cpu": "cpu", "gpu": f"{_gpu_platform()},cpu"}[device]
-    elif not _may_have_gpu():
+    elif not may_have_gpu():
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
     if deterministic:
         _add_flags("--xla_force_host_platform_device_count=1", "--xla_cpu_multi_thread_eigen=false")
@@ -57,7 +57,7 @@ def set_variables(device: Literal["cpu", "gpu"] | None, deterministic: bool) -> 
         _add_flags(f"--xla_force_host_platform_device_count={min(cores(), MAX_CPU_DEVICES)}")
     if "xla_cpu_collective" not in os.environ.get("XLA_FLAGS", ""):
         _add_flags(*PATIENT)
-    if device == "gpu" or (device is None and _may_have_gpu()):
+    if device == "gpu" or (device is None and may_have_gpu()):
         # By itself JAX multiplies float32 matrices in TF32 there, whose 10 bits conjugate gradients and line search do
         # not survive.
         os.environ.setdefault("JAX_DEFAULT_MATMUL_PRECISION", "highest")
@@ -72,7 +72,7 @@ def divide_gpu(jobs: int) -> None:
     By itself JAX takes three quarters of it in every process, so that the second of two runs finds none. A tenth is
     left for the driver.
     """
-    if jobs > 1 and _may_have_gpu() and os.environ.get("JAX_PLATFORMS") != "cpu":
+    if jobs > 1 and may_have_gpu() and os.environ.get("JAX_PLATFORMS") != "cpu":
         os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{0.9 / jobs:.3f}")
 
 
@@ -155,7 +155,8 @@ def _gpu_platform() -> str:
     return "rocm" if Path("/dev/kfd").exists() and not has_nvidia() else "cuda"
 
 
-def _may_have_gpu() -> bool:
+def may_have_gpu() -> bool:
+    """Whether JAX may find a GPU here; True where nothing cheap can tell."""
     return (
         sys.platform != "linux"
         or (has_nvidia() and any(find_spec(plugin) is not None for plugin in _CUDA_PLUGINS))

@@ -139,7 +139,7 @@ def bench(with_peers: bool, rounds: int, whole_iterations: bool, tell: Tell = la
             runs[name, "metrpo"] = works[name].run
             for peer, worker in workers.items():
                 for theirs in peers.WORK[peer]:
-                    if _counterpart(theirs, available) == name:
+                    if counterpart(theirs, available) == name:
                         runs[theirs, peer] = partial(_measure, worker, theirs)
         seconds: dict[tuple[str, str], list[float]] = {key: [] for key in runs}
         for number in range(rounds):
@@ -168,7 +168,7 @@ def _measure(worker: peers.PeerWorker, work: str) -> float:
     return worker.measure(work, 1)[0]
 
 
-def _counterpart(theirs: str, works: Mapping[str, object]) -> str:
+def counterpart(theirs: str, works: Mapping[str, object]) -> str:
     """Our name for a peer's work: the same, or without the variant behind the last hyphen (fit-1024-basic)."""
     return theirs if theirs in works else theirs.rsplit("-", 1)[0]
 
@@ -178,7 +178,7 @@ def _timing(
 ) -> Timing:
     median = statistics.median(values)
     if who != "metrpo":
-        same = seconds[_counterpart(name, works), "metrpo"]
+        same = seconds[counterpart(name, works), "metrpo"]
         ratios = [theirs / mine for theirs, mine in zip(values, same, strict=True)]
         return Timing(name, who, median, values, ratio=statistics.median(ratios))
     work = works[name]

@@ -135,7 +135,7 @@ def _starts(count: int) -> np.ndarray:
     return np.asarray(0.1 * _data(BATCH).states[:count])
 
 
-def _operations(width: str) -> float:
+def operations(width: str) -> float:
     """Of one prediction by one network."""
     sizes = (STATE + ACTION, *HIDDEN[width], STATE)
     return float(sum(2 * i * o for i, o in pairwise(sizes)))
@@ -164,8 +164,8 @@ def _fit(width: str, products: str) -> Work:
     steps()
     # Forward, and backward to the weights of every layer and to the inputs of every layer but the first.
     first = 2.0 * (STATE + ACTION) * HIDDEN[width][0]
-    operations = MEMBERS * BATCH * (3 * _operations(width) - first)
-    return Work(steps, operations, _rate(products), MEMBERS * BATCH)
+    of_a_step = MEMBERS * BATCH * (3 * operations(width) - first)
+    return Work(steps, of_a_step, _rate(products), MEMBERS * BATCH)
 
 
 def _rate(products: str) -> str:
@@ -185,7 +185,7 @@ def _imagine(width: str, products: str) -> Work:
     run = jax.jit(devices.spread(rollouts, mesh, (WHOLE, WHOLE, FIRST, WHOLE), (imagined, WHOLE)))
     given = (*devices.copied((simulator, policy), mesh), _starts(ROLLOUTS), jax.random.key(0))
     steps = ROLLOUTS * HORIZON
-    return Work(_timed(lambda: run(*given)), steps * _operations(width), _rate(products), steps)
+    return Work(_timed(lambda: run(*given)), steps * operations(width), _rate(products), steps)
 
 
 def _trpo(config: TRPOConfig) -> Work:
@@ -230,7 +230,7 @@ def _validate(width: str) -> Work:
     simulator = Simulator(_ensemble(width), task.reward, task.terminated, task.horizon)
     steps = MEMBERS * starts * HORIZON
     run = _timed(lambda: policy_phase.values_of(simulator, policy, _starts(starts)))
-    return Work(run, steps * _operations(width), "products", steps)
+    return Work(run, steps * operations(width), "products", steps)
 
 
 def _collect() -> Work:

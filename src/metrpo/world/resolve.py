@@ -151,13 +151,14 @@ def resolve(name: str, folder: Path | None = None, env_kwargs: tuple[str, ...] =
     if is_placed(name, env_kwargs):
         return _PLACES[name, env_kwargs]
     if module_of(name) is not None:
-        return _resolve(name, name, folder or Path.cwd(), env_kwargs)
+        return resolved(name, name, folder or Path.cwd(), env_kwargs)
     file = file_of(name)
-    return _resolve(name, name if file is None else f"{file}:{name.rpartition(':')[2]}", None, env_kwargs)
+    return resolved(name, name if file is None else f"{file}:{name.rpartition(':')[2]}", None, env_kwargs)
 
 
 @cache
-def _resolve(name: str, where: str, folder: Path | None, env_kwargs: tuple[str, ...]) -> Task | None:
+def resolved(name: str, where: str, folder: Path | None, env_kwargs: tuple[str, ...]) -> Task | None:
+    """The task of that name, which is found at `where`; None where nobody knows it."""
     if where.startswith("dm_control/"):
         _register_dm_control()
         if where in gymnasium.registry:
