@@ -562,9 +562,11 @@ def program(*arguments: str, **environment: str | None) -> subprocess.CompletedP
 
 
 @NO_GPU
-@pytest.mark.parametrize("platforms", [None, "cpu"])
-def test_a_gpu_that_is_not_there_is_one_message(platforms):
-    ran = program("train", "Swimmer", "--device", "gpu", "--run-dir", "a", JAX_PLATFORMS=platforms)
+@pytest.mark.parametrize(("platforms", "devices"), [(None, 1), ("cpu", 2)])
+def test_a_gpu_that_is_not_there_is_one_message(platforms, devices):
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    environment = {"JAX_PLATFORMS": platforms, "XLA_FLAGS": flags}
+    ran = program("train", "Swimmer", "--device", "gpu", "--run-dir", "a", **environment)
     assert ran.returncode == 2
     assert "metrpo: device: JAX finds no GPU here, only the CPU; install JAX for it (pip install " in ran.stderr
     assert "(pip install 'jax[cuda13]', or 'jax[cuda12]'" in ran.stderr

@@ -143,8 +143,9 @@ def _require_device(device: Literal["cpu", "gpu"] | None) -> None:
         raise MetrpoError(f"{error}; unset JAX_PLATFORMS, or install the GPU's JAX: {INSTALL_GPU}") from None
     import jax
 
-    if device == "gpu" and jax.devices()[0].platform != "gpu":
-        cpu = all(name.startswith("cpu") for name in names)
+    devices = jax.devices()
+    if device == "gpu" and devices[0].platform != "gpu":
+        cpu = {d.platform for d in devices} == {"cpu"}
         found = "only the CPU" if cpu else f"only {', '.join(names)}"
         raise MetrpoError(
             f"device: JAX finds no GPU here, {found}; install JAX for it ({INSTALL_GPU}), or use --device cpu"
