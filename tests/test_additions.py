@@ -1,0 +1,53 @@
+"""What a newcomer adds: a function, its row in a table and its name among the choices; nothing else knows of it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import metrpo
+import tiny_run
+from places import SUPPORT
+
+SAMPLING = '''
+
+def boldest_model(
+    ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
+) -> Float[Array, "N P"]:
+    """The largest of all models' predictions, dimension by dimension."""
+    return with_carried(ensemble, states, actions, jnp.max(_of_all_models(ensemble, states, actions), axis=0))
+
+
+SAMPLINGS["boldest_model"] = Sampling(boldest_model)
+'''
+IMPROVER = """
+
+def _bold(
+    settings: PhaseSettings, policy: Policy, moments: Any, batch: Batch, key: Key[Array, ""]
+) -> tuple[Policy, Any, ImproveInfo]:
+    print("bold", "compiles")
+    return vpg.improve(policy, moments, batch, settings.gradient, settings.mean_penalty)
+
+
+IMPROVERS["bold"] = _by_score_function(_bold)
+"""
+
+
+def test_a_new_sampling_and_a_new_improver_are_a_row_and_a_name_each(tmp_path):
+    """In a scratch copy of the package: they run by name, and the files that change are these three."""
+    package = tmp_path / "metrpo"
+    shutil.copytree(Path(metrpo.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    for name, text in (("model/sampling.py", SAMPLING), ("policy/improvers/improver_table.py", IMPROVER)):
+        (package / name).write_text((package / name).read_text() + text)
+    schema = package / "config" / "schema.py"
+    choices = schema.read_text().replace('"one_model"] = "step_rand"', '"one_model", "boldest_model"] = "step_rand"')
+    schema.write_text(choices.replace('"bptt-stochastic"]', '"bptt-stochastic", "bold"]'))
+    chosen = ["--iterations", "1", "--imagine.sampling", "boldest_model", "--improver", "bold"]
+    line = tiny_run.process_line(tmp_path / "run", *chosen)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (tmp_path, SUPPORT)))}
+    ran = subprocess.run(line, capture_output=True, text=True, env=environment)
+    assert ran.returncode == 0, ran.stderr
+    assert "bold compiles" in ran.stdout
+    assert metrpo.read_metrics(tmp_path / "run" / "metrics.csv")[0]["updates"] > 0
