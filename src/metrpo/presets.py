@@ -34,7 +34,7 @@ PAPER: dict[str, Overrides] = {
 FAST_ALL: Overrides = {
     "advantage.baseline": "network",
     "advantage.gae_lambda": 0.95,
-    "collect.max_std": 3.0,
+    "collect.max_std": 2.0,
     "collect.std_power": 3.0,
     "collect.parameter_noise": 1.0,
     "ensemble.hidden": (200, 200, 200),
