@@ -1,11 +1,13 @@
 """Results as a table, from the committed metrics: `python benchmarks/summarise.py [results/laptop/*/me-trpo ...]`.
 
 One row for each task and system under the given folders: over seeds, the last and the best real return (deterministic
-policy, mean of 20 episodes), the real steps they took, and the minutes of wall-clock time.
+policy, mean of 20 episodes), the worst seed's last one, what doing nothing and random actions earn (`yardsticks.py`), the
+real steps they took, and the minutes of wall-clock time.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +18,10 @@ from metrpo import read_metrics
 from metrpo.report.tables import markdown
 
 ROOT = Path(__file__).resolve().parents[1] / "results"
-HEADER = ("experiment", "task", "system", "seeds", "real steps", "last return", "best return", "last gap", "minutes")
+HEADER = (
+    *("experiment", "task", "system", "seeds", "real steps", "last return", "worst seed", "doing nothing"),
+    *("random actions", "best return", "last gap", "minutes"),
+)
 
 
 def systems(folders: list[Path]) -> list[Path]:
@@ -35,17 +40,28 @@ def row(system: Path) -> tuple[str, ...]:
         spread = f" ({', '.join(f'{v:.{digits}f}' for v in values)})" if len(values) > 1 else ""
         return f"{np.mean(values):.{digits}f}{spread}"
 
+    last = [_value(run[-1], "return_real") for run in runs]
     return (
         system.parent.parent.name,
         system.parent.name,
         system.name,
         str(len(runs)),
         f"{min(run[-1]['real_steps'] for run in runs):,}",
-        over_seeds([_value(run[-1], "return_real") for run in runs]),
+        over_seeds(last),
+        over_seeds([float(np.min(last))]),
+        *_no_skill(system),
         over_seeds([float(np.fmax.reduce([_value(r, "return_real") for r in run])) for run in runs]),
         over_seeds([_value(run[-1], "gap") for run in runs]),
         over_seeds([_value(run[-1], "wall_seconds") / 60 for run in runs]),
     )
+
+
+def _no_skill(system: Path) -> tuple[str, str]:
+    """What doing nothing and random actions earn on its task."""
+    task = json.loads(next(system.glob("seed-*/config.json")).read_text())["task"]
+    known = json.loads((ROOT / "yardsticks.json").read_text()).get(task, {})
+    zero, drawn = (f"{known[way]['mean']:.1f}" if way in known else "-" for way in ("zero", "random"))
+    return zero, drawn
 
 
 def _value(row: Mapping[str, float | None], column: str) -> float:

@@ -17,7 +17,8 @@ from metrpo.world.yardsticks import measure
 FILE = ROOT / "yardsticks.json"
 TASKS = (
     *("Swimmer", "Snake", "HalfCheetah", "Hopper", "HopperUpright", "Ant", "Humanoid", "HumanoidStandup"),
-    *("mbbl/Swimmer", "mbbl/HalfCheetah", "mbbl/Hopper", "mbbl/Ant"),
+    *("mbbl/Swimmer", "mbbl/HalfCheetah", "mbbl/Hopper", "mbbl/Ant", "mbbl/Pendulum", "mbbl/CartPole"),
+    *("Pendulum-v1", "InvertedPendulum-v5", "MountainCarContinuous-v0"),
 )
 
 
