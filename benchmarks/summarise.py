@@ -1,8 +1,8 @@
 """Results as a table, from the committed metrics: `python benchmarks/summarise.py [results/laptop/*/me-trpo ...]`.
 
 One row for each task and system under the given folders: over seeds, the last and the best real return (deterministic
-policy, mean of 20 episodes), the worst seed's last one, what doing nothing and random actions earn (`yardsticks.py`), the
-real steps they took, and the minutes of wall-clock time.
+policy, mean of 20 episodes), the last one of the worst seed, what doing nothing and random actions earn
+(`yardsticks.py`), the real steps they took, and the minutes of wall-clock time.
 """
 
 from __future__ import annotations
