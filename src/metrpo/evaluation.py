@@ -18,7 +18,7 @@ from metrpo.run.policy_file import LoadedPolicy, PolicyInfo, load_policy
 from metrpo.run.task_file import task_of_run
 from metrpo.run.video import record
 from metrpo.safe_load import brief
-from metrpo.world import collection
+from metrpo.world import batch_episodes, collection
 from metrpo.world.history_env import with_history
 from metrpo.world.registry import get_task, limited
 from metrpo.world.task import Task
@@ -86,7 +86,7 @@ def evaluate(
     if isinstance(act, LoadedPolicy):
         _require_fit(act, known)
         known = with_history(limited(known, Limits.of(act.info)), act.info.history)
-        act = act.of_state
+        return EvaluationResult(known.name, seed, batch_episodes.evaluate(known, act.of_state, episodes, seed))
     return EvaluationResult(known.name, seed, collection.evaluate(known, act, episodes, seed))
 
 

@@ -186,7 +186,7 @@ def test_a_policy_of_the_hub_runs_no_code_that_its_author_names(tmp_path, monkey
         with pytest.raises(TaskError, match="a name from elsewhere runs no code here; say what to play: --task"):
             use("hub:me/x")
     task = get_task("Swimmer")
-    monkeypatch.setattr("metrpo.world.collection.evaluate", lambda known, *_: np.array([float(known.horizon)]))
+    monkeypatch.setattr("metrpo.world.batch_episodes.evaluate", lambda known, *_: np.array([float(known.horizon)]))
     assert evaluate("hub:me/x", task="Swimmer").mean == task.horizon
     recorded = []
     monkeypatch.setattr("metrpo.evaluation.record", lambda make, policy, out, seed: recorded.append(str(out)) or out)

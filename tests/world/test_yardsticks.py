@@ -41,9 +41,8 @@ def test_doing_nothing_earns_what_a_loop_says():
 @pytest.mark.parametrize(("horizon", "episodes"), [(20, 10), (1000, 10), (4000, 2), (50_000, 1)])
 def test_long_episodes_are_played_less_often(monkeypatch, horizon, episodes):
     seen = []
-    monkeypatch.setattr(
-        world.collection, "evaluate", lambda t, act, n, seed, longest: seen.append((n, longest)) or np.zeros(n)
-    )
+    for way in (world.batch_episodes, world.collection):
+        monkeypatch.setattr(way, "evaluate", lambda t, act, n, seed, longest: seen.append((n, longest)) or np.zeros(n))
     world.measure(dataclasses.replace(probe.PROBE, horizon=horizon))
     assert seen == 2 * [(episodes, 10_000)]
 

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from metrpo.world import collection
-from metrpo.world.collection import Act
+from metrpo.world import batch_episodes, collection
 from metrpo.world.size_limits import RECORDED
 from metrpo.world.task import Task
 
@@ -52,18 +51,19 @@ def measure(task: Task, episodes: int | None = None, seed: int = 0) -> Yardstick
     episodes = episodes or min(EPISODES, max(1, STEPS // task.horizon))
     rng = np.random.default_rng(seed)
 
-    def zero(state: np.ndarray) -> np.ndarray:
-        return np.zeros(task.action_size)
+    def zero(states: np.ndarray) -> np.ndarray:
+        return np.zeros((*states.shape[:-1], task.action_size))
 
     def random(state: np.ndarray) -> np.ndarray:
         return rng.uniform(-1.0, 1.0, task.action_size)
 
-    return Yardsticks(*(_measured(task, act, episodes, seed) for act in (zero, random)))
+    of_zero = batch_episodes.evaluate(task, zero, episodes, seed, longest=RECORDED)
+    of_random = collection.evaluate(task, random, episodes, seed, longest=RECORDED)
+    return Yardsticks(_summary(of_zero), _summary(of_random))
 
 
-def _measured(task: Task, act: Act, episodes: int, seed: int) -> Yardstick:
-    returns = collection.evaluate(task, act, episodes, seed, longest=RECORDED)
-    return Yardstick(float(np.mean(returns)), float(np.std(returns)), episodes)
+def _summary(returns: np.ndarray) -> Yardstick:
+    return Yardstick(float(np.mean(returns)), float(np.std(returns)), len(returns))
 
 
 def _short(yardstick: Yardstick) -> str:
