@@ -95,7 +95,7 @@ def main() -> None:
         arguments.record.parent.mkdir(parents=True, exist_ok=True)
         arguments.record.write_text(json.dumps(measured, indent=1) + "\n")
     record = json.loads(arguments.record.read_text())
-    figure = Figure(figsize=(13, 3.6), dpi=130, layout="constrained")
+    figure = Figure(figsize=(10.5, 3.2), dpi=130, layout="constrained")
     for axes, (name, rows) in zip(figure.subplots(1, len(record), sharey=True), record.items(), strict=True):
         for what, label in (("fit", f"{STEPS} training steps"), ("improve", "5 policy updates, 1 validation")):
             axes.plot([row[name] for row in rows], [row[what] for row in rows], "o-", label=label)

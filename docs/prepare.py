@@ -37,6 +37,7 @@ WIDTH = 80
 """Of the commands' help, in characters: what fits beside the navigation."""
 _FENCE = re.compile(r"^( *)(```+).*?^\1\2 *$\n?", re.DOTALL | re.MULTILINE)
 _CODE_OR_LINK = re.compile(r"(`+)(?!`)(?:(?!\n\n).)*?\1(?!`)|\[((?:`[^`]*`|[^\[\]`])*)\]\(([^()\s]+)\)", re.DOTALL)
+_PICTURE = re.compile(r"!\[[^\]]*\]\(([^)\s]+\.(?:png|svg))\)")
 _INCLUDE = re.compile(r"^<!-- from ([\w./-]+)(?:: (.+?))? -->$", re.MULTILINE)
 
 
@@ -144,7 +145,7 @@ def check() -> Links:
 
 
 def commands() -> str:
-    """All commands in short, and a section for each: what --help-all prints, without its boxes."""
+    """All commands in short, and a section for each: what --help-all prints, without its boxes, sentences folded."""
     from metrpo.commands.command_table import NAMES
     from metrpo.commands.help import overview
     from metrpo.commands.parse import parse
@@ -165,7 +166,8 @@ def _help(parse: typing.Callable[[list[str]], object], name: str) -> str:
     printed.seek(0)
     text = re.sub(r"^╭─ (.*?) ─*╮$", r"\1:", printed.read(), flags=re.MULTILINE)
     text = re.sub(r"^╰─*╯$", "", text, flags=re.MULTILINE)
-    return re.sub(r"^│(.*?) *│$", r" \1", text, flags=re.MULTILINE).strip()
+    text = re.sub(r"^│(.*?) *│$", r" \1", text, flags=re.MULTILINE).strip()
+    return "\n".join(textwrap.fill(line, WIDTH, break_on_hyphens=False) if line[:1].strip() else line for line in text.splitlines())
 
 
 def _command(name: str, text: str) -> str:
@@ -211,12 +213,15 @@ def _settings_table(title: str, prefix: str, group: type, presets: dict[str, dic
             values = [preset.get(name, default) for preset in presets.values()]
             cells = ("" if value == default else _shown(value) for value in values)
             rows.append((f"`{name}`", shown, *cells, texts[field.name]))
-    return f"## {title}\n\n{group.__doc__}\n\n" + markdown(("setting", "default", *presets, "what it is"), rows)
+    table = markdown(("setting", "default", *presets, "what it is"), rows)
+    return f'## {title}\n\n{group.__doc__}\n\n<div class="settings" markdown>\n\n{table}\n</div>\n'  # see site.css
 
 
 def _shown(value: object) -> str:
     if isinstance(value, tuple):
         return "-".join(map(str, value)) or "none"
+    if isinstance(value, float) and len(str(value)) > 8:  # 1/3
+        return f"{value:.4f}"
     return "none" if value is None else {"True": "yes", "False": "no"}.get(str(value), str(value))
 
 
@@ -241,6 +246,7 @@ def main() -> int:
         text = with_includes(page, rendered(page, links, repository), links, repository)
         for made in (commands, settings):
             text = re.sub(rf"^<!-- {made.__name__} -->$", lambda _, made=made: made(), text, flags=re.MULTILINE)
+        text = _PICTURE.sub(r"[\g<0>](\1)", text)  # a figure is narrow on a phone: it leads to itself, of full size
         (out / page.name).write_text(text)
     for image in links.images:
         copy = out / "tree" / image.relative_to(ROOT)

@@ -45,7 +45,7 @@ def draw(name: str, runs: Sequence[RunSpec], out: Path, path: Path) -> bool:
 def _draw_curves(picture: Picture, figure: Figure, curves: list[Curves]) -> None:
     tasks = list(dict.fromkeys(c.task for c in curves))
     columns = min(len(tasks), _COLUMNS)
-    picture.set_size_inches(max(5.2 * columns, 6.5), 0.5 + 4.4 * -(-len(tasks) // _COLUMNS))
+    picture.set_size_inches(max(3.8 * columns, 5.2), 0.5 + 3.2 * -(-len(tasks) // _COLUMNS))
     labels = list(figure.systems)
     for axes, task in zip(_panels(picture, len(tasks)), tasks, strict=True):
         for c in (c for c in curves if c.task == task):
@@ -75,7 +75,7 @@ def _draw_band(axes: Axes, curves: Curves, colour: str, log: bool) -> None:
 def _draw_overfitting(picture: Picture, figure: Figure, curves: list[Curves]) -> None:
     """Imagined and real return after every policy phase: a row for each system, a column for each seed."""
     columns = max(len(c.runs) for c in curves)
-    picture.set_size_inches(4.2 * columns, 3.1 * len(curves))
+    picture.set_size_inches(3.8 * columns, 2.6 * len(curves))
     grid = picture.subplots(len(curves), columns, squeeze=False)
     for row, c in zip(grid, curves, strict=True):
         for axes, (steps, real), (_, imagined), run in zip(

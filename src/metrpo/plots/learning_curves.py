@@ -96,7 +96,7 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
     tasks = list(dict.fromkeys(g.task for g in groups))
     columns = min(len(tasks), 3)
     lines = -(-len(tasks) // columns)
-    figure = Figure(figsize=(max(5.2 * columns, 6.5), 4.2 * lines + 0.5), dpi=130, layout="constrained")
+    figure = Figure(figsize=(max(3.8 * columns, 5.2), 3.1 * lines + 0.5), dpi=130, layout="constrained")
     panels = list(figure.subplots(lines, columns, squeeze=False).flat)
     for axes, task in zip(panels, tasks, strict=False):
         of_task = [g for g in groups if g.task == task]
