@@ -35,7 +35,8 @@ th,td{padding:.4rem .7rem;text-align:right;border-bottom:1px solid var(--rule);w
 th:first-child{text-align:left;position:sticky;left:0;background:var(--card)}
 tbody tr:last-child>*{border-bottom:0}thead th{color:var(--soft);font-weight:500}
 tbody th{font-weight:500}
-#runs th:first-child,#groups th:first-child{white-space:normal;min-width:7rem;max-width:26rem;overflow-wrap:anywhere}
+#runs th:first-child,#groups th:first-child{white-space:normal;min-width:9rem;max-width:26rem;overflow-wrap:anywhere}
+#groups thead th{white-space:normal;vertical-align:bottom}
 figure{margin:0;background:var(--card);border:1px solid var(--rule);border-radius:.6rem;padding:.6rem;min-width:0}
 figcaption{padding:0 .2rem .3rem;line-height:1.3}
 .grid{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(330px,100%),1fr));gap:.8rem;margin:.6rem 0}
