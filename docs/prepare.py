@@ -167,7 +167,9 @@ def _help(parse: typing.Callable[[list[str]], object], name: str) -> str:
     text = re.sub(r"^╭─ (.*?) ─*╮$", r"\1:", printed.read(), flags=re.MULTILINE)
     text = re.sub(r"^╰─*╯$", "", text, flags=re.MULTILINE)
     text = re.sub(r"^│(.*?) *│$", r" \1", text, flags=re.MULTILINE).strip()
-    return "\n".join(textwrap.fill(line, WIDTH, break_on_hyphens=False) if line[:1].strip() else line for line in text.splitlines())
+    return "\n".join(
+        textwrap.fill(line, WIDTH, break_on_hyphens=False) if line[:1].strip() else line for line in text.splitlines()
+    )
 
 
 def _command(name: str, text: str) -> str:

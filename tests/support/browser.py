@@ -48,6 +48,8 @@ class Seen(NamedTuple):
     """Pairs of texts of one chart that lie on each other."""
     shot: bytes
     """PNG, of `height` pixels or all there is."""
+    answer: Any
+    """To the question, as JSON has it."""
 
 
 class Browser:
@@ -71,8 +73,16 @@ class Browser:
     def __exit__(self, *_: object) -> None:
         self._open.close()
 
-    def look(self, page: Path, width: int, dark: bool = False, height: int | None = None, scroll: int = 0) -> Seen:
-        """What the browser makes of a file; at 640 pixels and less it is a phone."""
+    def look(
+        self,
+        page: Path,
+        width: int,
+        dark: bool = False,
+        height: int | None = None,
+        scroll: int = 0,
+        question: str = "null",
+    ) -> Seen:
+        """What the browser makes of a file, and its answer to JavaScript; at 640 pixels and less it is a phone."""
         target = self._ask("Target.createTarget", url="about:blank")["targetId"]
         session = self._ask("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         self._events.clear()
@@ -91,6 +101,7 @@ class Browser:
         self._wait_for("Page.loadEventFired")
         measured = ask("Runtime.evaluate", expression=_MEASURE, returnByValue=True, awaitPromise=True)
         found = measured["result"]["value"]
+        answered = ask("Runtime.evaluate", expression=question, returnByValue=True)
         tall = height or min(found["height"], 16_000)
         clip = {"x": 0, "y": scroll, "width": width, "height": tall, "scale": 1}
         shot = ask("Page.captureScreenshot", format="png", captureBeyondViewport=True, clip=clip)["data"]
@@ -103,6 +114,7 @@ class Browser:
             found["wide"],
             found["overlapping"],
             base64.b64decode(shot),
+            answered["result"].get("value"),
         )
 
     def _ask(self, method: str, session: str | None = None, **given: Any) -> dict[str, Any]:
