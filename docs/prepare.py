@@ -136,6 +136,11 @@ def with_includes(page: Path, text: str, links: Links, repository: str = "") -> 
     return _INCLUDE.sub(include, text)
 
 
+def with_full_size(text: str) -> str:
+    """The text with figures that lead to themselves, for in a column, or on a phone, some are small."""
+    return _PICTURE.sub(r"[\g<0>](\1)", text)
+
+
 def check() -> Links:
     """All links of all pages, followed: those to other hosts are looked at and not asked for."""
     links = Links([], set(), set())
@@ -248,8 +253,7 @@ def main() -> int:
         text = with_includes(page, rendered(page, links, repository), links, repository)
         for made in (commands, settings):
             text = re.sub(rf"^<!-- {made.__name__} -->$", lambda _, made=made: made(), text, flags=re.MULTILINE)
-        text = _PICTURE.sub(r"[\g<0>](\1)", text)  # a figure is narrow on a phone: it leads to itself, of full size
-        (out / page.name).write_text(text)
+        (out / page.name).write_text(with_full_size(text))
     for image in links.images:
         copy = out / "tree" / image.relative_to(ROOT)
         copy.parent.mkdir(parents=True, exist_ok=True)

@@ -4,7 +4,7 @@
 
 Takes a screenshot of each page at both widths and prints what does not fit: pages wider than the window, code and
 tables that scroll sideways, figures shown at less than half of their size on a desk, broken pictures, dead links within
-the site. The exit code is 1 for a page wider than the window, code that scrolls on a desk, a broken picture, a dead link.
+the site. The exit code is 1 for a page wider than the window, code that scrolls on a desk, broken pictures, dead links.
 Needs Chromium (Debian, Ubuntu: `apt install chromium`); it runs without a network.
 """
 
@@ -34,7 +34,8 @@ _FOUND = """
       ...wide("code", document.querySelectorAll("pre > code"), longest),
       ...wide("table", document.querySelectorAll(".md-typeset__scrollwrap"), e => e.querySelector("tr").innerText),
       ...pictures.filter(i => i.complete && !i.naturalWidth).map(i => ["broken picture", 0, i.src]),
-      ...pictures.filter(i => innerWidth > 640 && i.clientWidth < i.naturalWidth / 2).map(i => ["small figure", i.clientWidth, i.src]),
+      ...pictures.filter(i => innerWidth > 640 && i.clientWidth < i.naturalWidth / 2)
+        .map(i => ["small figure", i.clientWidth, i.src]),
     ],
     links: [...document.querySelectorAll("a[href]")].map(a => a.href),
     ids: [...document.querySelectorAll("[id]")].map(e => e.id),

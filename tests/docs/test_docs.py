@@ -30,6 +30,8 @@ from pages import PAGES, ROOT, SHELL, Block, blocks, mentioned, typed
 BRIEF = probe.BRIEF | {"collect.steps": 400, "collect.max_train": 400, "iterations": 2}
 CHEAP = {"evaluate", "export", "plot", "report", "tasks"}
 """Commands that really run, where the run that they are to read is there."""
+FITS = 104
+"""Characters in a line of code that the site shows at 1280 pixels: 107 as measured, less a scroll bar of 15 pixels."""
 NAVIGATION = re.findall(r"([\w-]+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
 prepare = runpy.run_path(str(ROOT / "docs" / "prepare.py"))
 
@@ -64,6 +66,15 @@ def test_every_link_leads_somewhere():
 
 def test_every_page_stands_in_the_navigation():
     assert sorted(NAVIGATION) == sorted(page.name for page in PAGES if page.parent.name == "docs")
+
+
+def test_code_does_not_scroll_sideways():
+    """Neither what is written nor what the site adds; `benchmarks/tools/look.py` measures it in a browser."""
+    texts = {name(page): page.read_text() for page in PAGES} | {"the commands' help": prepare["commands"]()}
+    fence = re.compile(r"^( *)```.*?^\1```", re.DOTALL | re.MULTILINE)
+    lines = [(where, line) for where, text in texts.items() for f in fence.finditer(text) for line in f[0].splitlines()]
+    assert len(lines) > 500
+    assert [f"{where}: {line}" for where, line in lines if len(line) > FITS] == []
 
 
 @pytest.mark.timeout(600)  # some 20 s of compilation, once, on a quiet machine
@@ -203,6 +214,9 @@ def test_every_setting_has_a_row_with_its_values_and_its_text():
         for cells in re.findall(r"^\| `([a-z_.]+)` \| (.*?) \| (.*?) \| (.*?) \| (.+) \|$", text, re.M)
     }
     assert rows.keys() == config.flatten(metrpo.preset("Swimmer")).keys()
+    labels = re.findall(r'content: "(.+) "', (ROOT / "docs" / "site.css").read_text())
+    assert f"| setting | {' | '.join(labels)} | what it is |" in text, "a phone shows the columns' names by site.css"
+    assert rows["collect.validation_fraction"][0] == "0.3333"
     assert rows["ensemble.hidden"][:3] == ("1024-1024", "200-200-200", "200-200-200")
     assert rows["fit.max_steps"][:3] == ("none", "4000", "1500")
     assert rows["trpo.max_kl"] == (
@@ -228,5 +242,6 @@ def test_what_preparing_a_page_does(tmp_path):
     for target in ("../src/metrpo/clo.py", "fast-preset.md#weight", "../../elsewhere.md", "ftp://example.org"):
         lead(target)
     assert [problem.split(": ")[0] for problem in links.problems] == ["tasks.md:3"] * 4
+    assert prepare["with_full_size"]("![a](b/c.png) ![d](e.gif)") == "[![a](b/c.png)](b/c.png) ![d](e.gif)"
     assert prepare["section"]("# A\nx\n```sh\n# B\n```\n## C\ny\n", "A") == "x\n```sh\n# B\n```\n"
     assert prepare["section"]("# A\n", "B") is None
