@@ -4,7 +4,8 @@
 
 Takes a screenshot of each page at both widths and prints what does not fit: pages wider than the window, code and
 tables that scroll sideways, figures shown at less than half of their size on a desk, broken pictures, dead links within
-the site. The exit code is 1 for a page wider than the window, code that scrolls on a desk, broken pictures, dead links.
+the site. The exit code is 1 for pages wider than the window, code or tables that scroll on a desk, broken pictures and
+dead links.
 Needs Chromium (Debian, Ubuntu: `apt install chromium`); it runs without a network.
 """
 
@@ -67,7 +68,7 @@ def main() -> int:
             rows += seen.answer["found"]
             for kind, pixels, text in rows:
                 print(f"{page.name:<24} {width:>5}  {kind:<15} {pixels:>5}  {text}")
-                wrong += kind in ("page", "broken picture") or (kind == "code" and width == DESK)
+                wrong += kind in ("page", "broken picture") or (kind in ("code", "table") and width == DESK)
     dead = [f"{page.name}: {link}" for page in pages for link in answers[page]["links"] if _dead(link, answers)]
     print(*(f"dead link in {link}" for link in dead), sep="\n", end="\n" if dead else "")
     print(f"{len(pages)} pages, {wrong + len(dead)} faults; screenshots in {given.out}")
