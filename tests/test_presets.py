@@ -22,6 +22,7 @@ CITED = {
     "improver": ("trpo", 'section 4, "Policy Optimization": the best results were achieved by TRPO'),
     "collect.steps": (3000, "A.1.1: 3000 timesteps of real world data for every environment, except Humanoid"),
     "collect.std_power": (1.0, "A.1.1: sampled from U[0.0, 3.0]"),
+    "collect.noise_correlation": (0.0, "A.1.1: the stochastic policy acts, whose actions are drawn at every step anew"),
     "collect.max_std": (3.0, "A.1.1: standard deviation sampled from U[0.0, 3.0]"),
     "collect.std_per": ("episode", "A.1.1: at the beginning of every roll-out, fixed throughout the episode"),
     "collect.parameter_noise": (3.0, "A.1.1: proportional to the absolute difference of parameters; factor 3.0: code"),

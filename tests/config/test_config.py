@@ -115,6 +115,7 @@ IMPOSSIBLE = {
     "collect.steps": [0],
     "collect.max_std": [-0.1, float("inf"), float("nan")],
     "collect.std_power": [0.0, -1.0, float("inf"), float("nan")],
+    "collect.noise_correlation": [-0.1, 1.0, float("nan")],
     "collect.parameter_noise": [-1.0, float("nan")],
     "collect.validation_fraction": [0.0, 1.0, -0.5, float("nan")],
     "collect.max_train": [0],

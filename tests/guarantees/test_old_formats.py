@@ -34,6 +34,7 @@ AS_IT_WAS = {
     "advantage.gae_lambda": 1.0,
     "collect.max_std": 3.0,
     "collect.std_power": 1.0,
+    "collect.noise_correlation": 0.0,
     "collect.parameter_noise": 3.0,
     "ensemble.delta_std_floor": 1e-4,
     "ensemble.std_floor": 0.1,

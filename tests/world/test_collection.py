@@ -78,6 +78,19 @@ def test_one_std_per_episode_is_a_power_of_a_uniform_draw(power):
     assert abs(np.corrcoef(z[:-1, 0], z[1:, 0])[0, 1]) < 0.03
 
 
+def test_correlated_noise_is_as_strong_and_keeps_its_direction():
+    """A first-order autoregressive process: the correlation k steps apart is that of one step to the power k."""
+    episodes = collect(probe.LONG_PROBE, max_std=0.2, noise_correlation=0.8, steps=200 * 150)
+    stds = [max(e.actions.std(), 1e-3) for e in episodes]
+    assert stats.kstest(stds, stats.uniform(scale=0.2).cdf).pvalue > 1e-3
+    z = np.array([e.actions / s for e, s in zip(episodes, stds, strict=True)])
+    for apart in (1, 3, 10):
+        assert np.mean(z[:, :-apart] * z[:, apart:]) == pytest.approx(0.8**apart, abs=0.05)
+    assert np.mean(z[:, 0] ** 2) == pytest.approx(1.0, abs=0.2), "from the first step on"
+    assert abs(np.mean(z[..., 0] * z[..., 1])) < 0.05
+    assert abs(np.mean(z[:-1, -1] * z[1:, 0])) < 0.2, "each episode has noise of its own"
+
+
 def test_one_std_per_step_varies_within_the_episode():
     episodes = collect(probe.LONG_PROBE, max_std=0.2, steps=200 * 150, std_per="step")
     stds = np.array([e.actions.std() for e in episodes])

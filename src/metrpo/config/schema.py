@@ -25,6 +25,9 @@ class CollectConfig:
     """1: any standard deviation is as likely (the paper). More: most are small, and now and then one is large."""
     std_per: Literal["episode", "step"] = "episode"
     """How often that standard deviation is drawn: once an episode (the paper) or at every step (authors' code)."""
+    noise_correlation: float = 0.0
+    """Correlation of the noise from one step to the next, at least 0 and below 1: with 0 each step's noise is
+    independent (the paper); with 0.9 it keeps its direction for some ten steps, and so moves a body further."""
     parameter_noise: float = 3.0
     """Scale of the parameter noise: std = scale * |policy - previous policy|, redrawn every episode; 0: none."""
     validation_fraction: float = 1 / 3
@@ -38,6 +41,12 @@ class CollectConfig:
         require(self.steps >= 1, "collect.steps", self.steps, "at least 1")
         require(nonnegative(self.max_std), "collect.max_std", self.max_std, "a finite number >= 0")
         require(positive(self.std_power), "collect.std_power", self.std_power, "a finite number > 0")
+        require(
+            0 <= self.noise_correlation < 1,
+            "collect.noise_correlation",
+            self.noise_correlation,
+            "at least 0 and below 1",
+        )
         require(
             nonnegative(self.parameter_noise), "collect.parameter_noise", self.parameter_noise, "a finite number >= 0"
         )

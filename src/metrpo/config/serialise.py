@@ -17,6 +17,7 @@ from metrpo.safe_load import brief, json_of
 
 ADDED = (
     "config.collect.std_power",
+    "config.collect.noise_correlation",
     "config.fit.products",
     "config.policy.normalise",
     "config.policy.min_std",

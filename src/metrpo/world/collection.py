@@ -134,9 +134,10 @@ def reset_states(task: Task, count: int, rng: np.random.Generator) -> np.ndarray
 
 
 def explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
-    """`mean` plus std x N(0, I), std = max_std x U[0, 1] ** std_power per episode or step.
+    """`mean` plus std x noise, std = max_std x U[0, 1] ** std_power per episode or step.
 
-    The paper (appendix A.1.1) has the power 1.
+    The noise of a step is N(0, I), and correlated with that of the step before: a first-order autoregressive process.
+    The paper (appendix A.1.1) has the power 1 and no correlation.
     """
 
     def draw() -> float:
@@ -149,11 +150,15 @@ def explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
             if config.std_per == "step":
                 std = draw()
 
-    std = stds()
+    std, kept, last = stds(), config.noise_correlation, list[np.ndarray]()
 
     def act(state: np.ndarray) -> np.ndarray:
         action = mean(state)
-        return action + next(std) * rng.standard_normal(action.shape)
+        noise = rng.standard_normal(action.shape)
+        if last:
+            noise = kept * last.pop() + math.sqrt(1 - kept**2) * noise
+        last.append(noise)
+        return action + next(std) * noise
 
     return act
 
