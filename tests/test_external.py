@@ -121,7 +121,7 @@ def test_a_broken_environment_ends_with_how_to_go_on(tmp_path, monkeypatch, caps
     assert main.main(command) == 2
     err = capsys.readouterr().err
     assert "metrpo: collect, iteration 1: the motor is hot" in err
-    assert "run keeps every finished iteration and real episode. The same command goes on." in err
+    assert "run keeps every finished iteration and real episode. The same command resumes." in err
     assert len(EpisodeLog(tmp_path / "run").pending()) == 2
 
 

@@ -193,8 +193,8 @@ WRONG = [
     (["train", "Swimmer", "--preset", "slow"], "--preset"),
     (["train", "Swimmer", "--config.task", "Ant"], "--config.task"),
     (["train", "Swimmer", "--task", "Ant"], "--task"),
-    (["train", "Swimmer", "--iterations", "3", "--real-steps", "100"], "give --iterations or --real-steps, not both"),
-    (["tune", "--search", "a=1,2", "--iterations=3", "--real_steps=9"], "give --iterations or --real-steps, not both"),
+    (["train", "Swimmer", "--iterations", "3", "--real-steps", "100"], "expected --iterations or --real-steps, got both; leave one out"),
+    (["tune", "--search", "a=1,2", "--iterations=3", "--real_steps=9"], "expected --iterations or --real-steps, got both; leave one out"),
     (["train"], "metrpo: train needs a task: metrpo train TASK; metrpo tasks lists them"),
     (["init", "--task", "x", "Swimmer"], "metrpo: init takes TASK without --task: metrpo init TASK"),
     (["evaluate", "--dir=a"], "metrpo: evaluate takes DIR without --dir: metrpo evaluate DIR"),
@@ -305,7 +305,7 @@ def test_every_file_that_is_asked_for_may_lie_in_a_new_folder(capsys, monkeypatc
     assert run(command, "a", "--out", f"new/folder/{file}") == 0
     assert Path("new/folder", file).exists()
     assert run(command, "--help") == 0
-    assert "missing folders are made" in " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert "missing folders are created" in " ".join(capsys.readouterr().out.replace("│", " ").split())
 
 
 def test_render_names_its_file(capsys):
@@ -424,7 +424,7 @@ def test_switches_and_methods_read_the_right_way(capsys, monkeypatch):
     for command, option, meaning in (
         ("train", "--no-video", "Do not record"),
         ("reproduce", "--no-run", "Run nothing"),
-        ("bench", "--no-iterations", "Do not time"),
+        ("bench", "--no-iterations", "Skip whole iterations"),
     ):
         assert run(command, "--help") == 0
         text = " ".join(capsys.readouterr().out.replace("│", " ").split())
@@ -433,7 +433,7 @@ def test_switches_and_methods_read_the_right_way(capsys, monkeypatch):
     assert run("train", "--help-all") == 0
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "ppo and ddpg are Stable-Baselines3's" in text, "the system"
-    assert "This ppo is ours, within the ensemble" in text, "the improver"
+    assert "This ppo learns in the ensemble" in text, "the improver"
 
 
 @pytest.mark.parametrize("preset_", ["fast", "paper"])
@@ -630,5 +630,5 @@ def test_a_stopped_run_says_how_to_go_on(number, code):
         process.send_signal(number)
         _, err = process.communicate(timeout=30)
     assert process.returncode == code
-    kept = "a keeps every finished iteration and real episode. The same command goes on."
+    kept = "a keeps every finished iteration and real episode. The same command resumes."
     assert err == f"metrpo: stopped; {kept}\n\n  metrpo train Swimmer --run-dir a\n\n"

@@ -103,7 +103,7 @@ def largest_file(size):
 def assert_told(err, run_dir, reason):
     assert f"metrpo: cannot write {run_dir}/" in err
     assert f"{reason}; make room or choose a writable directory\n" in err
-    kept = f"metrpo: stopped; {run_dir} keeps every finished iteration and real episode. The same command goes on."
+    kept = f"metrpo: stopped; {run_dir} keeps every finished iteration and real episode. The same command resumes."
     assert f"{kept}\n\n  metrpo train Probe --run-dir {run_dir}" in err
 
 

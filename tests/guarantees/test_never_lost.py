@@ -211,7 +211,7 @@ def test_the_run_stops_where_every_episode_fails(tmp_path, taught, monkeypatch, 
     assert main.main(tiny_run.command_line(run_dir)) == 2
     err = capsys.readouterr().err
     assert "10 episodes before it failed too: repair the environment" in err
-    assert "The same command goes on" not in err
+    assert "The same command resumes" not in err
     monkeypatch.undo()
     with probe.registered():
         train(tiny_run.CONFIG, run_dir)
@@ -228,7 +228,7 @@ def test_an_exception_is_tried_once_more_and_then_left_out(tmp_path, taught, mon
     monkeypatch.setattr(Sick, "sickness", staticmethod(hot))
     command = tiny_run.command_line(tmp_path / "run")
     assert main.main(command) == 2
-    assert "The same command goes on." in capsys.readouterr().err
+    assert "The same command resumes." in capsys.readouterr().err
     assert main.main(command) == 0
     rows = read_metrics(tmp_path / "run" / "metrics.csv")
     assert [row["failed_episodes"] for row in rows] == [1, 0, 0]
@@ -260,7 +260,7 @@ def test_resets_of_nan_are_drawn_again():
     assert np.all(states[:, 0] <= 0.3)
 
 
-# ---------------------------------------------------------------- "The same command goes on", where it can
+# ---------------------------------------------------------------- "The same command resumes", where it can
 
 
 def test_what_cannot_go_on_does_not_say_so(tmp_path, taught, monkeypatch, capsys):
@@ -328,7 +328,7 @@ def test_a_request_to_stop_does_not_wait_for_a_long_episode(tmp_path, monkeypatc
     assert main.main(tiny_run.command_line(tmp_path / "run")) == 143
     assert time.monotonic() - began[0] < 1.5
     assert not list((tmp_path / "run").glob("episodes/*.npz"))
-    assert "The same command goes on." in capfd.readouterr().err
+    assert "The same command resumes." in capfd.readouterr().err
 
 
 def test_a_short_episode_is_finished_first(monkeypatch):

@@ -94,7 +94,7 @@ def test_the_first_ends_the_run_after_its_step(number, code, stage, saved, tmp_p
     assert Counted.kept == EPISODES + {None: 0, "collect": 1}.get(stage, EPISODES), "the episode under way is kept"
     err = capfd.readouterr().err
     assert ("stopping after this" in err) == (stage is not None)
-    kept = f"metrpo: stopped; {run_dir} keeps every finished iteration and real episode. The same command goes on."
+    kept = f"metrpo: stopped; {run_dir} keeps every finished iteration and real episode. The same command resumes."
     assert f"{kept}\n\n  {shlex.join(['metrpo', *command_line(run_dir)])}\n" in err
     assert_it_goes_on(run_dir, expected)
 
@@ -106,7 +106,7 @@ def test_the_second_ends_it_at_once_and_loses_the_step_only(stage, tmp_path, exp
         send(patch, signal.SIGINT, 2, 2, stage)
         assert main.main(command_line(tmp_path / "run")) == 130
     assert finished(tmp_path / "run") == [1]
-    assert "The same command goes on." in capfd.readouterr().err
+    assert "The same command resumes." in capfd.readouterr().err
     assert_it_goes_on(tmp_path / "run", expected)
 
 
@@ -119,13 +119,13 @@ def test_in_the_last_evaluation_nothing_goes_on(tmp_path, expected, monkeypatch,
     err = capfd.readouterr().err
     assert "goes on" not in err
     command = shlex.join(["metrpo", *command_line(run_dir)])
-    again = f"The same command would only make what is missing of its record, such as the video.\n\n  {command}\n"
+    again = f"The same command would only write the files that are missing, such as the video.\n\n  {command}\n"
     assert f"metrpo: stopped; {run_dir} is complete: nothing is lost. {again}" in err
     assert differing(result(run_dir), expected) == []
     with monkeypatch.context() as patch:
         send(patch, signal.SIGTERM, 1, tiny_run.ITERATIONS + 1, "collect")
         assert main.main(command_line(run_dir, "--iterations", str(tiny_run.ITERATIONS + 1))) == 143
-    assert "The same command goes on." in capfd.readouterr().err, "a larger budget is not spent"
+    assert "The same command resumes." in capfd.readouterr().err, "a larger budget is not spent"
 
 
 @pytest.mark.parametrize("times", [1, 2])
@@ -225,5 +225,5 @@ def test_a_process_ends_so(number, code, tmp_path):
         _, err = process.communicate(timeout=350)
     assert process.returncode == code
     assert "metrpo: stopping after this iteration; once more stops at once" in err
-    assert "The same command goes on.\n\n  metrpo train Probe --run-dir" in err
+    assert "The same command resumes.\n\n  metrpo train Probe --run-dir" in err
     assert finished(tmp_path / "run") == [1]

@@ -109,7 +109,7 @@ def test_a_budget_is_each_runs_and_names_no_folder(tmp_path):
         (tmp_path / "grid.toml").write_text(f'tasks = ["Swimmer"]\nseeds = [0]\n{name} = 7000')
         assert from_file(tmp_path / "grid.toml").runs() == runs
     for words in ("--iterations 3 --real-steps 4", "--iterations 3 --set real_steps=100"):
-        with pytest.raises(ConfigError, match=r"not both|leave one out"):
+        with pytest.raises(ConfigError, match="leave one out"):
             told(words).runs()
     (tmp_path / "grid.toml").write_text('tasks = ["Swimmer"]\niterations = 3\nreal_steps = 4')
     with pytest.raises(ConfigError, match="got both"):

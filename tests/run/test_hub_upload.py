@@ -55,7 +55,7 @@ def test_a_dry_run_writes_the_card_and_lists_the_files(tmp_path, monkeypatch, ca
     assert main.main(["push", str(run_dir), "--repo", "me/swim", "--dry-run"]) == 0
     out = capsys.readouterr().out
     assert {line.split()[0] for line in out.splitlines()[:-1]} == FILES
-    assert out.splitlines()[-1] == f"would be sent to me/swim; the card (README.md): {run_dir / 'model_card.md'}"
+    assert out.splitlines()[-1] == f"would upload to me/swim; the card (README.md): {run_dir / 'model_card.md'}"
     head, body = head_of((run_dir / "model_card.md").read_text())
     assert (head["library_name"], "Swimmer" in head["tags"]) == ("metrpo", True)
     (result,) = head["model-index"][0]["results"]
@@ -72,7 +72,7 @@ def test_a_dry_run_writes_the_card_and_lists_the_files(tmp_path, monkeypatch, ca
     ):
         assert said in body, said
     assert main.main(["push", str(run_dir), "--dry-run"]) == 0
-    assert "would be sent to OWNER/metrpo-Swimmer;" in capsys.readouterr().out
+    assert "would upload to OWNER/metrpo-Swimmer;" in capsys.readouterr().out
 
 
 def test_what_a_run_lacks_the_card_says(tmp_path):

@@ -489,7 +489,7 @@ def test_a_signal_is_in_the_exit_code(tmp_path, faked, monkeypatch, capsys, erro
 
     monkeypatch.setattr(tuning, "tune", stopped)
     assert main.main(command(tmp_path)) == code
-    assert "The same command goes on" in capsys.readouterr().err
+    assert "The same command resumes" in capsys.readouterr().err
 
 
 def test_every_kind_of_setting_is_drawn_and_shown(tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""How a command ends that is stopped: it says what is kept, and that the same command goes on."""
+"""What a stopped command says: what is kept, and that the same command resumes."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ def say(text: str) -> None:
         print(text, file=sys.stderr)
 
 
-def say_how_to_go_on(error: BaseException, arguments: Sequence[str]) -> None:
-    """Prints the notes of what has stopped the command `arguments`, and the command where it goes on."""
+def say_how_to_resume(error: BaseException, arguments: Sequence[str]) -> None:
+    """Prints the notes of what stopped the command `arguments`, and the command to type where it resumes."""
     for note in getattr(error, "__notes__", ()):
         command = f"\n\n  {shlex.join(['metrpo', *arguments])}\n" if "same command" in note else ""
         say(f"metrpo: stopped; {note}{command}")
 
 
 def _keeps(folder: Path, what: str) -> str:
-    return f"{folder} keeps {what}. The same command goes on."
+    return f"{folder} keeps {what}. The same command resumes."
 
 
 @contextmanager
@@ -38,19 +38,19 @@ def attended_run(
     keeps_episodes: bool = True,
     complete: Callable[[Interruptible], str | None] = lambda progress: None,
 ) -> Iterator[Interruptible]:
-    """What reports on a run in this block; whoever or whatever stops the run there is told how to go on.
+    """Reports on a run in this block. What stops the run there gets a note that says how to resume.
 
-    `complete` says what is true where a signal came too late to stop anything; else None.
+    `complete` returns the note for a signal that came too late to stop anything; else None.
     """
     with Interruptible(shown, keeps_episodes) as progress:
         try:
             yield progress
         except (Stopped, KeyboardInterrupt, MetrpoError) as error:
-            # What else goes wrong (a file that is missing, a policy that diverged) would do so again.
-            may_go_on = isinstance(error, KeyboardInterrupt | EpisodeError | RunDirectoryError)
+            # Other errors (a missing file, a policy that diverged) would come again.
+            may_resume = isinstance(error, KeyboardInterrupt | EpisodeError | RunDirectoryError)
             if isinstance(error, Stopped | KeyboardInterrupt) and (note := complete(progress)):
                 error.add_note(note)
-            elif isinstance(error, Stopped) or (progress.began and may_go_on):
+            elif isinstance(error, Stopped) or (progress.began and may_resume):
                 error.add_note(_keeps(run_dir, "every finished iteration and real episode"))
             raise
         finally:
@@ -59,7 +59,7 @@ def attended_run(
 
 @contextmanager
 def attended_runs(folder: Path) -> Iterator[None]:
-    """Many runs under `folder` in this block: whoever or whatever stops them there is told how to go on."""
+    """Many runs under `folder` in this block. What stops them there gets a note that says how to resume."""
     signal.signal(signal.SIGTERM, stop)
     try:
         yield

@@ -1,4 +1,4 @@
-"""`metrpo bench` measures this machine and our work on it."""
+"""`metrpo bench` measures how fast this machine runs metrpo."""
 
 from __future__ import annotations
 
@@ -14,20 +14,19 @@ from metrpo.commands.options import Switch, require_at_least_one
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure this machine and our work on it: fitting, imagination, policy updates, whole iterations.
+    """Measure how fast this machine runs metrpo: fitting, imagination, policy updates, whole iterations.
 
-    Run nothing else meanwhile. All pieces are timed in turns, round after round, so that all see the same machine;
-    medians count.
+    Run nothing else meanwhile. Each round times every piece once, so that all see the same machine; medians count.
     For example:
         metrpo bench
         metrpo bench --peers --rounds 9 --json > bench.json
     """
 
     peers: Switch = False
-    """Measure mbrl-lib, sb3-contrib and PyTorch too; the first time installs them (gigabytes), apart from ours."""
+    """Measure mbrl-lib, sb3-contrib and PyTorch too; the first time installs them (gigabytes) in a separate folder."""
     rounds: int = 7
-    """How often each piece is timed."""
-    iterations: Annotated[Switch, arg(help="Do not time whole outer iterations and process starts (minutes).")] = True
+    """How many times to time each piece."""
+    iterations: Annotated[Switch, arg(help="Skip whole iterations and process starts (minutes).")] = True
     json: Switch = False
     """Print JSON."""
 

@@ -16,10 +16,10 @@ from metrpo.counting import counted
 
 @dataclass(frozen=True)
 class Collect:
-    """Add real episodes to a run, which its next iteration learns from; one that was stopped goes on.
+    """Add real episodes to a run. Its next iteration learns from them.
 
-    It plays the task's environment with exploration, or takes episodes that were
-    recorded elsewhere. They are on disk as soon as they end. For example:
+    Plays the task's environment with exploration, or takes recorded episodes. Each episode is saved as soon as it
+    ends, so the same command resumes a stopped collection. For example:
         metrpo collect runs/arm
         metrpo collect runs/arm --steps 1000
         metrpo collect runs/arm --data today.npz
@@ -28,11 +28,11 @@ class Collect:
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """The run directory."""
     steps: Annotated[int | None, arg(metavar="INT")] = None
-    """Play until at least this many steps wait; default: the run's collect.steps."""
+    """Play until at least this many new steps wait to be learned from; default: the run's collect.steps."""
     data: Annotated[str | None, arg(metavar="FILE")] = None
-    """Instead: minari:NAME, or an .npz of logged states, actions, rewards, next_states, terminated."""
+    """Instead of playing: minari:NAME, or an .npz of states, actions, rewards, next_states, terminated."""
     task: Annotated[str | None, arg(metavar="TASK")] = None
-    """Where the run's task is, if its file or module has moved."""
+    """The run's task, if its file or module has moved."""
     json: Switch = False
     """Print JSON."""
 

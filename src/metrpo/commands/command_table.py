@@ -1,7 +1,7 @@
-"""Every command: what it is for, its name and what it does. The file of that name holds the rest.
+"""Every command: its group, its name and what it does. The file of that name holds the rest.
 
-`metrpo train` is `train.py`: the dataclass `Train`, of which tyro makes a parser, and `run(Train)`, which returns the
-exit code. To add a command, write its file and its row here.
+`metrpo train` is `train.py`: the dataclass `Train`, which tyro turns into a parser, and `run(Train)`, which returns
+the exit code. To add a command, write its file and add its row here.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ from typing import Any
 
 COMMANDS: dict[str, dict[str, str]] = {
     "Learn": {
-        "train": "Learn a task, or go on with a run",
-        "tasks": "List the tasks that can be learnt",
+        "train": "Learn a task, or resume a run",
+        "tasks": "List the tasks to learn",
     },
     "Look": {
-        "watch": "Show where many runs stand, live",
+        "watch": "Show the progress of many runs, live",
         "report": "Write one HTML page: curves, warnings, videos",
         "plot": "Draw learning curves",
-        "compare": "Set runs side by side in a table",
+        "compare": "Compare runs in a table",
     },
     "Use": {
         "zoo": "List the trained policies that come with metrpo",
-        "evaluate": "Play real episodes and say what they earn",
+        "evaluate": "Play real episodes and report their returns",
         "render": "Record an episode as a video",
-        "export": "Write the policy as one file without metrpo",
-        "push": "Send the policy to the Hugging Face hub",
+        "export": "Write the policy as one file that needs no metrpo",
+        "push": "Upload the policy to the Hugging Face hub",
     },
     "Many runs": {
         "sweep": "Run a grid of tasks, seeds and settings",
@@ -34,13 +34,13 @@ COMMANDS: dict[str, dict[str, str]] = {
         "reproduce": "Run and draw a figure of the paper",
     },
     "Your robot": {
-        "init": "Start a run whose episodes another program plays",
+        "init": "Start a run whose episodes your own program plays",
         "collect": "Add real episodes to a run",
-        "improve": "Learn from the episodes that wait, once",
+        "improve": "Learn from the new episodes, in one iteration",
     },
     "This machine": {
         "doctor": "Check versions, devices, OpenGL, video encoder",
-        "bench": "Measure this machine and our work on it",
+        "bench": "Measure how fast this machine runs metrpo",
     },
 }
 """Purpose -> command -> what it does, in a few words."""

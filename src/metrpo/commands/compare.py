@@ -1,4 +1,4 @@
-"""`metrpo compare` sets groups of runs side by side."""
+"""`metrpo compare` compares groups of runs in a table."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from metrpo.errors import ConfigError
 
 @dataclass(frozen=True)
 class Compare:
-    """Set runs side by side, seeds grouped by task and settings: returns, intervals, how soon, which is better.
+    """Compare runs, seeds grouped by task and settings: returns, intervals, real steps needed, and which is better.
 
     For example:
         metrpo compare runs/sweep
@@ -27,11 +27,10 @@ class Compare:
     dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
     """Run directories, or folders with runs inside."""
     level: Annotated[tuple[str, ...], arg(metavar="RETURN...")] = ()
-    """Return whose real steps are counted: a number, or TASK=NUMBER for each task; default: what all groups reach on
-    average."""
+    """Count the real steps to this return: a number, or TASK=NUMBER for each task; default: the highest mean return
+    that all groups reach."""
     against: Annotated[str | None, arg(metavar="SYSTEM")] = None
-    """The group that the others are held against, as the table calls it; default: me-trpo, or each
-    task's first."""
+    """The group to compare the others with, as the table names it; default: me-trpo, or each task's first."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """Also write the table to this file: .md, .csv, .tex or .html."""
     json: Switch = False

@@ -1,4 +1,4 @@
-"""Where a run lives unless its command says so: one folder for each way to run a task, told apart by its name."""
+"""The default run directory: one folder for each way to run a task, whose name says the way."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from metrpo.presets import bare
 from metrpo.run.files import folder_name
 
 _MOST, _LONGEST = 3, 60
-"""Settings that a name spells out, and the letters that they may take."""
+"""How many settings a name spells out at most, and in how many letters."""
 
 
 def default_run_dir(config: Config) -> Path:
-    """`runs/TASK-[SYSTEM-]PRESET-seedSEED`, and after it the settings that are not the preset's, budget aside.
+    """`runs/TASK-[SYSTEM-]PRESET-seedSEED`, then the settings that are not the preset's, budget aside.
 
-    The same settings always lead to the same folder. More of them than a name can hold become a hash.
+    The same settings always give the same folder. Where the name would grow too long, a hash stands for them.
     """
     system = "" if config.system == "me-trpo" else f"{config.system}-"
     plain = Path("runs") / f"{folder_name(config.task)}-{system}{config.preset}-seed{config.seed}"

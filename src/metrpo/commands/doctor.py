@@ -11,9 +11,9 @@ from metrpo.commands.options import Switch
 
 @dataclass(frozen=True)
 class Doctor:
-    """Check this machine: versions, devices, OpenGL and the video encoder, and say what to install.
+    """Check this machine (versions, devices, OpenGL, video encoder) and say what to install.
 
-    The exit code is 0 when training can work. For example:
+    The exit code is 0 if training can work. For example:
         metrpo doctor
         metrpo doctor --json
     """
@@ -26,7 +26,7 @@ def run(command: Doctor) -> int:
     """Returns the exit code: 1 where training cannot work."""
     from metrpo.run import machine
 
-    machine.set_variables(None, deterministic=False)  # what is wrong with them is what it looks for
+    machine.set_variables(None, deterministic=False)  # doctor itself reports what is wrong with them
     from metrpo.run.installation import diagnose
 
     diagnosis = diagnose()

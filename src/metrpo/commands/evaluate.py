@@ -15,7 +15,7 @@ from metrpo.counting import counted
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Play real episodes with a run's policy, without noise, and report what they earn.
+    """Play real episodes with a run's policy, without noise, and report their returns.
 
     For example:
         metrpo evaluate runs/Swimmer-fast-seed0
@@ -25,11 +25,11 @@ class Evaluate:
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """The run directory, zoo:NAME (see: metrpo zoo), or hub:OWNER/NAME on the Hugging Face hub."""
     episodes: int = 20
-    """How many."""
+    """Number of episodes."""
     seed: int = 0
-    """Decides the start states."""
+    """Seed of the start states."""
     task: Annotated[str | None, arg(metavar="TASK")] = None
-    """Where the run's task is, if its file or module has moved."""
+    """The run's task, if its file or module has moved."""
     json: Switch = False
     """Print JSON."""
 

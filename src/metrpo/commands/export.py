@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg
 
 @dataclass(frozen=True)
 class Export:
-    """Write a run's policy as one file that needs no metrpo: Python with NumPy alone, or ONNX.
+    """Write a run's policy as one file that runs without metrpo: Python with only NumPy, or ONNX.
 
     For example:
         metrpo export runs/Swimmer-fast-seed0
@@ -22,7 +22,7 @@ class Export:
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """The run directory, zoo:NAME (see: metrpo zoo), or hub:OWNER/NAME on the Hugging Face hub."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
-    """File to write, .py, .onnx or .npz; default: policy.py in the run directory; missing folders are made."""
+    """File to write, .py, .onnx or .npz; missing folders are created; default: policy.py in the run directory."""
 
 
 def run(command: Export) -> int:

@@ -1,4 +1,4 @@
-"""What help shows: a list of commands that fits a screen, and of a run's many settings the few that people use."""
+"""What help shows: the commands on one screen, and the few settings of a run that people use."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ def overview() -> str:
     for purpose, commands in COMMANDS.items():
         for i, (name, text) in enumerate(commands.items()):
             lines.append(f"{purpose if i == 0 else '':<14}{name:<11}{text}")
-    lines += ["", 'Start with: metrpo train Swimmer. "metrpo COMMAND --help" explains a command;']
-    return "\n".join([*lines, '"metrpo train --help-all" lists every setting; "metrpo --version" is there too.'])
+    lines += ["", 'Start with: metrpo train Swimmer. "metrpo COMMAND --help" explains a command,']
+    return "\n".join([*lines, '"metrpo train --help-all" lists every setting, "metrpo --version" prints the version.'])
 
 
 def shown(kind: Any, default: Any, only: Collection[str] | None = None) -> tuple[Any, Any]:
-    """The class of a command as help is to show it, and `default` (None: the class's own values) as one of it.
+    """The class of a command as help shows it, and `default` (None: the class's own values) as an instance of it.
 
-    Options beyond `only` (None: all) are left out. No default is told where it says nothing: of a switch, or None.
+    Options beyond `only` (None: all) are left out. Help gives no default for a switch or for None.
     """
     hints = typing.get_type_hints(kind, include_extras=True)
     changed = []

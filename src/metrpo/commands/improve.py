@@ -1,4 +1,4 @@
-"""`metrpo improve` learns from the episodes that wait."""
+"""`metrpo improve` learns from a run's new episodes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from metrpo.console.interrupt import Interruptible
 
 @dataclass(frozen=True)
 class Improve:
-    """Learn from the episodes that wait in a run: fit the models, improve the policy, write it. One iteration.
+    """Learn from a run's new episodes, in one iteration: fit the models, improve the policy and save it.
 
     For example:
         metrpo improve runs/arm
@@ -25,7 +25,7 @@ class Improve:
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """The run directory."""
     task: Annotated[str | None, arg(metavar="TASK")] = None
-    """Where the run's task is, if its file or module has moved."""
+    """The run's task, if its file or module has moved."""
     json: Switch = False
     """Print the iteration's metrics as JSON."""
 
@@ -41,8 +41,8 @@ def run(command: Improve) -> int:
     from metrpo.run.policy_file import FILE
 
     def complete(progress: Interruptible) -> str | None:
-        done = f"{command.dir} has learned from the episodes that waited: nothing is lost, and nothing is left to do."
-        return done if progress.ended else None
+        note = f"{command.dir} has learned from the new episodes: nothing is lost, and nothing is left to do."
+        return note if progress.ended else None
 
     with attended_run(command.dir, SILENT if command.json else default_progress(), complete=complete) as progress:
         row = improve(command.dir, progress, command.task)

@@ -1,4 +1,4 @@
-"""`metrpo init` starts a run whose episodes another program plays."""
+"""`metrpo init` starts a run whose episodes your own program plays."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from metrpo.commands.options import RunOptions
 
 @dataclass(frozen=True)
 class Init(RunOptions):
-    """Start a run whose episodes another program plays: a robot's own, say. Takes the same settings as train.
+    """Start a run whose episodes your own program plays, on a robot, say. Takes the same settings as train.
 
-    It writes the untrained policy. Then, again and again: play DIR's policy, add
-    the episodes (or call metrpo.append_episode in the program), improve. For example:
+    Writes the untrained policy. Then repeat: play the policy in DIR, add the episodes
+    (or call metrpo.append_episode in your program), improve. For example:
         metrpo init path/to/arm.py:task --run-dir runs/arm
         metrpo collect runs/arm --data today.npz
         metrpo improve runs/arm
 
-    Every setting starts from the task's preset; metrpo init --help-all lists all.
+    Every setting starts from the task's preset; metrpo init --help-all lists them all.
     """
 
 
@@ -32,6 +32,6 @@ def run(command: Init) -> int:
     begin(config, run_dir)
     collect = f"metrpo collect {shlex.quote(str(run_dir))}"
     how = collect if task_for(config).playable else f"metrpo.append_episode, or {collect} --data FILE"
-    print(f"{run_dir / FILE} is the untrained policy; add episodes ({how}), then")
+    print(f"{run_dir / FILE} is the untrained policy; add episodes ({how}), then run")
     print(f"metrpo improve {shlex.quote(str(run_dir))}")
     return 0

@@ -1,7 +1,7 @@
-"""The command line: finds the command in the table, runs it and makes an exit code of its end.
+"""The command line: finds the command in the table, runs it and returns its exit code.
 
-Whatever imports JAX or MuJoCo is imported where it is used: help must come at once, and JAX reads its environment
-variables when imported.
+Modules that import JAX or MuJoCo are imported where they are used: help must come at once, and JAX reads its
+environment variables when imported.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import os
 import sys
 from collections.abc import Sequence
 
-from metrpo.commands.attend import say, say_how_to_go_on
+from metrpo.commands.attend import say, say_how_to_resume
 from metrpo.commands.command_table import handler
 from metrpo.commands.parse import parse
 from metrpo.console.encoding import print_anywhere
@@ -35,13 +35,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return handler(arguments[0])(options)
     except MetrpoError as error:
         say(f"metrpo: {error}")
-        say_how_to_go_on(error, arguments)
+        say_how_to_resume(error, arguments)
         return 2
     except KeyboardInterrupt as stopped:
-        say_how_to_go_on(stopped, arguments)
+        say_how_to_resume(stopped, arguments)
         return 130
     except Stopped as stopped:
-        say_how_to_go_on(stopped, arguments)
+        say_how_to_resume(stopped, arguments)
         return 128 + stopped.number
     except BrokenPipeError:  # `metrpo train --help | head`
         return 1

@@ -13,7 +13,7 @@ from metrpo.config import Config, ImproverName, Method, Preset, System
 from metrpo.errors import ConfigError
 
 Switch = Annotated[bool, FlagCreatePairsOff]
-"""A bool with one option, which turns it: --json, or --no-video. Settings of a run have two, for presets differ."""
+"""A bool with one option, which flips it: --json, or --no-video. Settings of a run have two, for presets differ."""
 
 
 @dataclass(frozen=True)
@@ -23,35 +23,35 @@ class RunOptions(Config):
     task: Annotated[Positional[str], arg(metavar="TASK")] = "Swimmer"
     """Name of the task (see: metrpo tasks), a Gymnasium id, module:name or path/to/file.py:name."""
     env_kwargs: Annotated[tuple[str, ...], arg(metavar="KEY=VALUE...")] = ()
-    """Keyword arguments that the environment is made with: g=5.0 mode=easy 'size=[1, 2]'."""
+    """Keyword arguments of the environment: g=5.0 mode=easy 'size=[1, 2]'."""
     imports: Annotated[tuple[str, ...], arg(name="import", aliases=("--imports",), metavar="MODULE...")] = ()
-    """Modules to import first: those that register the environment."""
+    """Modules to import first, because they register the environment."""
     preset: Preset = "fast"
-    """What all other settings start from. fast: learns soonest on two CPU cores; paper: the paper's values;
+    """The defaults of all other settings. fast: learns soonest on two CPU cores; paper: the paper's values;
     long-horizon: for tasks of 1,000 steps."""
     system: Annotated[System, arg(metavar="NAME")] = "me-trpo"
-    """The method: me-trpo, or one to compare it with. trpo, ppo, ddpg, svg-1 and svg-inf learn without the ensemble:
-    trpo, ppo and ddpg on real steps alone (ppo and ddpg are Stable-Baselines3's). Others, such as model-ppo and k-1,
-    change a few settings of me-trpo."""
+    """The method: me-trpo, or one to compare it with. trpo, ppo, ddpg, svg-1 and svg-inf learn without the ensemble;
+    trpo, ppo and ddpg learn from real steps only (ppo and ddpg are Stable-Baselines3's). The others, such as
+    model-ppo and k-1, change a few settings of me-trpo."""
     method: Annotated[Method, arg(metavar="NAME")] = "model-based"
-    """The loop, which --system chooses: model-based (the paper's), or a baseline: trpo, Stable-Baselines3's ppo and
-    ddpg, svg."""
+    """The training loop, which --system chooses: model-based (the paper's), or a baseline: trpo, svg, or
+    Stable-Baselines3's ppo and ddpg."""
     improver: ImproverName = "trpo"
-    """How the policy is improved on imagined steps: by score functions (trpo, ppo, vpg) or through the models
-    (bptt). This ppo is ours, within the ensemble; --ppo.clip and the like are its settings."""
+    """How to improve the policy on imagined steps: by score functions (trpo, ppo, vpg) or by backpropagation through
+    the models (bptt). This ppo learns in the ensemble; --ppo.clip and the like are its settings."""
     iterations: int = 10
-    """The budget: outer iterations; may be raised later to go on with a finished run."""
+    """The budget: outer iterations. Raise it later to continue a finished run."""
     real_steps: Annotated[int | None, arg(metavar="INT")] = None
-    """Instead of --iterations: go on until this many real steps have been collected; 0: learn from --data alone."""
+    """Instead of --iterations: train until this many real steps are collected; 0: learn from --data alone."""
     data: Annotated[str | None, arg(metavar="FILE")] = None
-    """Logged transitions to begin with: minari:NAME or an .npz of states, actions, rewards, next_states, terminated."""
+    """Offline data to start from: minari:NAME, or an .npz of states, actions, rewards, next_states, terminated."""
     history: Annotated[int, arg(metavar="N")] = 1
-    """How many of the last observations policy and models see, with the actions between them: 3 for actions that come
-    two steps late, or where no sensor shows velocities."""
+    """How many of the latest observations the policy and the models see, with the actions between them. Take 3 if
+    actions take effect two steps late, or if no sensor measures velocities."""
     run_dir: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Where the run lives; default: runs/TASK-[SYSTEM-]PRESET-seedSEED, and the settings that are not the preset's."""
+    """The run directory; default: runs/TASK-[SYSTEM-]PRESET-seedSEED, and the settings that are not the preset's."""
     device: Annotated[Literal["cpu", "gpu"] | None, arg(metavar="{cpu,gpu}")] = None
-    """Where JAX computes; default: a GPU if JAX can use one."""
+    """Where JAX computes; default: a GPU if JAX finds one."""
 
     @property
     def config(self) -> Config:
@@ -60,7 +60,7 @@ class RunOptions(Config):
 
     @property
     def directory(self) -> Path:
-        """Where the run lives."""
+        """The run directory."""
         from metrpo.commands.default_dir import default_run_dir
 
         return self.run_dir or default_run_dir(self.config)
@@ -89,7 +89,7 @@ FEW = frozenset(
 
 
 def require_directories(command: str, directories: tuple[Path, ...]) -> None:
-    """Raises `ConfigError` when there is none."""
+    """Raises `ConfigError` when there are no directories."""
     if not directories:
         raise ConfigError(f"{command} needs run directories, or folders with runs inside: metrpo {command} runs")
 
@@ -101,9 +101,9 @@ def require_at_least_one(name: str, count: int | None) -> None:
 
 
 def require_file_alone(command: object, spec: Path | None, apart: tuple[str, ...]) -> None:
-    """Raises `ConfigError` when a file says what is run and options other than `apart` say so too."""
+    """Raises `ConfigError` when options other than `apart` are given together with the file `spec`."""
     if spec is None:
         return
     fields = [f for f in dataclasses.fields(command) if f.name not in apart]  # type: ignore[arg-type]
     if twice := [f.name for f in fields if getattr(command, f.name) != f.default]:
-        raise ConfigError(f"{twice[0]}: expected it in {spec} alone; write it there, or leave the file out")
+        raise ConfigError(f"{twice[0]}: expected it in {spec} alone, got it as an option; write it there")

@@ -22,8 +22,7 @@ _HELP = ("-h", "--help", "--help-all")
 def parse(arguments: list[str]) -> Any:
     """The options of a command as typed; for `train` and `init`, with the task's preset as the defaults.
 
-    Raises `SystemExit` after printing help, `MetrpoError` for what makes no sense, an impossible value or an unknown
-    task.
+    Raises `SystemExit` after printing help, `MetrpoError` for unknown words, impossible values and unknown tasks.
     """
     if arguments[0] in _HELP:
         print(overview())
@@ -42,7 +41,7 @@ def _parse_run(kind: type[RunOptions], arguments: list[str], asked: str | None) 
     from metrpo.presets import preset
 
     only = FEW if asked in ("-h", "--help") else None
-    # Which defaults? That is among the arguments: they are read twice.
+    # The arguments decide the defaults, so they are read twice.
     any_task = _defaults(kind, preset("Swimmer"))
     try:
         first = understood(lambda: _tyro(kind, any_task, arguments), kind, arguments)
@@ -56,8 +55,8 @@ def _parse_run(kind: type[RunOptions], arguments: list[str], asked: str | None) 
     from metrpo.world.registry import get_task
 
     task = get_task(first.task, first.env_kwargs, first.imports).name
-    given = {"env_kwargs": first.env_kwargs, "imports": first.imports}
-    defaults = _defaults(kind, preset(task, first.preset, first.system, **given))
+    of_task = {"env_kwargs": first.env_kwargs, "imports": first.imports}
+    defaults = _defaults(kind, preset(task, first.preset, first.system, **of_task))
     if asked is not None:
         _show(kind, defaults, arguments[0], only)
     parsed = understood(lambda: _tyro(kind, defaults, arguments), kind, arguments)

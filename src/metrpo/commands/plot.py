@@ -15,7 +15,7 @@ from metrpo.commands.output import warn_of_skipped
 
 @dataclass(frozen=True)
 class Plot:
-    """Draw learning curves: a line with a band over the seeds for every group of runs that share their settings.
+    """Draw learning curves: a line with a band over the seeds for each group of runs with the same settings.
 
     For example:
         metrpo plot runs/sweep
@@ -27,28 +27,28 @@ class Plot:
     dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
     """Run directories, or folders with runs inside."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("curves.png")
-    """File to write, .png, .svg or .pdf; missing folders are made."""
+    """File to write, .png, .svg or .pdf; missing folders are created."""
     x: Literal["real_steps", "wall_seconds", "iteration"] = "real_steps"
-    """What the curves are drawn against."""
+    """Column on the x axis."""
     y: Annotated[str, arg(metavar="COLUMN")] = "return_real"
     """Column of metrics.csv or diagnostics.csv to draw, such as gap, outside, error_T, error_10_3 or improved_0."""
 
     title: Annotated[str | None, arg(metavar="TEXT")] = None
     """Title above the panels."""
     x_label: Annotated[str | None, arg(metavar="TEXT")] = None
-    """Name of the x axis."""
+    """Label of the x axis."""
     y_label: Annotated[str | None, arg(metavar="TEXT")] = None
-    """Name of the y axis."""
+    """Label of the y axis."""
     x_limits: Annotated[tuple[float, float] | None, arg(metavar="LOW HIGH")] = None
     """Ends of the x axis."""
     y_limits: Annotated[tuple[float, float] | None, arg(metavar="LOW HIGH")] = None
     """Ends of the y axis."""
     x_scale: Literal["auto", "linear", "log"] = "auto"
-    """The x axis; auto: logarithmic where some runs are many times longer than others."""
+    """Scale of the x axis; auto: logarithmic if some runs are many times longer than others."""
     y_scale: Literal["auto", "linear", "log"] = "auto"
-    """The y axis; auto: logarithmic for errors of models. Points at or below 0 have no place on a logarithmic one."""
+    """Scale of the y axis; auto: logarithmic for model errors. A logarithmic axis leaves out points at or below 0."""
     legend: Literal["below", "inside", "none"] = "below"
-    """Where the groups are named."""
+    """Where to put the legend."""
 
     def __post_init__(self) -> None:
         require_directories("plot", self.dirs)

@@ -1,4 +1,4 @@
-"""`metrpo push` sends a run's policy to the Hugging Face hub."""
+"""`metrpo push` uploads a run's policy to the Hugging Face hub."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from metrpo.commands.options import Switch
 
 @dataclass(frozen=True)
 class Push:
-    """Send a finished run's policy to the Hugging Face hub, with a model card, its settings and its numbers.
+    """Upload a finished run's policy to the Hugging Face hub, with a model card, its settings and its metrics.
 
     Needs: pip install 'metrpo[hub]', and a login (hf auth login, or HF_TOKEN).
     For example:
@@ -25,11 +25,11 @@ class Push:
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """The run directory."""
     repo: Annotated[str | None, arg(metavar="OWNER/NAME")] = None
-    """The repository, made where there is none; default: metrpo-TASK of whoever is logged in."""
+    """The repository, created if there is none; default: metrpo-TASK of the user who is logged in."""
     private: Switch = False
-    """Make the repository a private one."""
+    """Create the repository as a private one."""
     dry_run: Switch = False
-    """Only write the card, to model_card.md in the run directory, and list the files; no network is needed."""
+    """Only write model_card.md into the run directory and list the files; needs no network."""
 
 
 def run(command: Push) -> int:
@@ -42,7 +42,7 @@ def run(command: Push) -> int:
         atomic_write(command.dir / CARD, made.card)
         sizes = {name: len(c) if isinstance(c, bytes) else c.stat().st_size for name, c in made.files.items()}
         print("\n".join(f"{name:<14}{size:>12,} bytes" for name, size in sizes.items()))
-        print(f"would be sent to {made.repo}; the card (README.md): {command.dir / CARD}")
+        print(f"would upload to {made.repo}; the card (README.md): {command.dir / CARD}")
         return 0
     made = parcel(command.dir, command.repo)  # before anybody is asked for a token
     if command.repo is None:

@@ -21,11 +21,11 @@ class Render:
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """The run directory, zoo:NAME (see: metrpo zoo), or hub:OWNER/NAME on the Hugging Face hub."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
-    """File to write, .mp4 or .gif; default: video.mp4 in the run directory; missing folders are made."""
+    """File to write, .mp4 or .gif; missing folders are created; default: video.mp4 in the run directory."""
     seed: int = 0
-    """Decides the start state."""
+    """Seed of the start state."""
     task: Annotated[str | None, arg(metavar="TASK")] = None
-    """Where the run's task is, if its file or module has moved."""
+    """The run's task, if its file or module has moved."""
 
 
 def run(command: Render) -> int:

@@ -15,9 +15,9 @@ from metrpo.commands.output import warn_of_skipped
 
 @dataclass(frozen=True)
 class Report:
-    """Write one HTML page about some runs: health warnings in plain words, learning curves, diagnostics, videos.
+    """Write one HTML page about runs: health warnings in plain words, learning curves, diagnostics, videos.
 
-    The page works without a network, on a phone too. Folders are searched for runs. For example:
+    The page works offline, on a phone too. For example:
         metrpo report runs/Swimmer-fast-seed0
         metrpo report runs/sweep --out sweep.html
         metrpo report runs --json
@@ -26,9 +26,9 @@ class Report:
     dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN_OR_FOLDER...")]
     """Run directories, or folders with runs inside."""
     out: Annotated[Path, arg(metavar="FILE")] = Path("report.html")
-    """File to write; missing folders are made."""
+    """File to write; missing folders are created."""
     json: Switch = False
-    """Print what the page says as JSON, besides writing it."""
+    """Write the page and print its contents as JSON."""
 
     def __post_init__(self) -> None:
         require_directories("report", self.dirs)

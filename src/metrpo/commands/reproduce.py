@@ -17,10 +17,10 @@ from metrpo.launch.backend import Means
 
 @dataclass(frozen=True)
 class Reproduce:
-    """Run what a figure of the paper compares, and draw it: every run an ordinary `metrpo train`.
+    """Run the comparison behind a figure of the paper, and draw it. Every run is an ordinary `metrpo train`.
 
     FIGURE is comparison, optimizers, ensemble-size, overfitting, sampling, validation, wall-clock, or all. Finished
-    runs are kept, stopped ones go on, and the figure shows what there is. For example:
+    runs are kept, stopped ones resume, and the figure shows all runs so far. For example:
         metrpo reproduce all --scale smoke
         metrpo reproduce optimizers --tasks Swimmer --seeds 3 --jobs 2
         metrpo reproduce all --scale laptop --no-run
@@ -30,14 +30,14 @@ class Reproduce:
     figure: Annotated[Positional[str], arg(metavar="FIGURE")]
     """Which figure, or all."""
     scale: Literal["smoke", "laptop", "paper"] = "laptop"
-    """smoke: minutes, learns nothing; laptop: hours on two cores; paper: as in the paper, weeks on two cores."""
+    """smoke: takes minutes, learns nothing; laptop: hours on two cores; paper: as in the paper, weeks on two cores."""
     tasks: tuple[str, ...] = ()
-    """Only these of the figure's tasks; default: the scale's."""
+    """Only these tasks of the figure; default: the scale's."""
     seeds: Annotated[int | None, arg(metavar="INT")] = None
     """Seeds 0, 1, ... of each system; default: the scale's."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder of the runs and of figures/; default: runs/reproduce-<scale>."""
-    run: Annotated[Switch, arg(help="Run nothing: draw what is there.")] = True
+    """Folder for the runs and for figures/; default: runs/reproduce-<scale>."""
+    run: Annotated[Switch, arg(help="Run nothing; draw the runs so far.")] = True
     json: Switch = False
     """Print the figures' numbers as JSON."""
     means: Annotated[Means, OmitArgPrefixes] = field(default_factory=Means)
@@ -61,4 +61,4 @@ def run(command: Reproduce) -> int:
     numbers = publish(names, command.scale, command.tasks, runs, out, tell)
     if command.json:
         print(json.dumps(numbers))
-    return exit_code(len(failed), len(runs), "run", "the same command tries again")
+    return exit_code(len(failed), len(runs), "run", "the same command tries them again")

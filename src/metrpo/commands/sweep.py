@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 class Sweep:
     """Run a grid: every task with every system, seed and combination of settings, each an ordinary `metrpo train`.
 
-    Finished runs are kept, stopped ones go on, a run that fails does not stop the
-    others. Lists may be given at once (--set A B) or one by one (--set A --set B).
+    Finished runs are kept, stopped ones resume, and a run that fails does not stop
+    the others. Give lists at once (--set A B) or one by one (--set A --set B).
     For example:
         metrpo sweep --tasks Swimmer HalfCheetah --seeds 0:5 --out runs/seeds
         metrpo sweep --set ensemble.members=1,5,10 trpo.max_kl=0.01,0.03 --jobs 4
@@ -41,8 +41,8 @@ class Sweep:
     """
 
     spec: Annotated[Positional[Path | None], arg(metavar="SPEC")] = None
-    """The grid as a TOML file: tasks, systems, seeds, iterations or real_steps, preset and tables [budget] and [set];
-    instead of the options of these names."""
+    """The grid as a TOML file, instead of options: tasks, systems, seeds, iterations or real_steps, preset, and tables
+    [budget] and [set]."""
     tasks: Annotated[tuple[str, ...], arg(metavar="TASK...")] = ("Swimmer",)
     """Tasks, as metrpo train takes them."""
     systems: Annotated[tuple[System, ...], arg(metavar="NAME...")] = ("me-trpo",)
@@ -50,19 +50,19 @@ class Sweep:
     seeds: Annotated[tuple[str, ...], arg(metavar="SEEDS...")] = ("0:3",)
     """Seeds: numbers, ranges such as 0:5 (0 to 4), or lists such as 0,2,7."""
     iterations: Annotated[int | None, arg(metavar="INT")] = None
-    """Outer iterations of every run; default: the preset's. May be raised later to go on with finished runs."""
+    """Outer iterations of every run; default: the preset's. Raise it later to continue finished runs."""
     real_steps: Annotated[int | None, arg(metavar="INT")] = None
     """Instead of --iterations: real steps of every run."""
     budget: Annotated[tuple[str, ...], arg(metavar="SYSTEM=STEPS...")] = ()
-    """Real steps of single systems' runs, instead of the above: trpo=300000 ppo=300000."""
+    """Real steps for the runs of single systems, instead of the above: trpo=300000 ppo=300000."""
     preset: Preset = "fast"
-    """What all other settings start from."""
+    """The defaults of all other settings."""
     set: Annotated[tuple[str, ...], arg(metavar="NAME=VALUES...")] = ()
     """Settings and their values: ensemble.members=1,5,10 or ensemble.hidden=[200,200],[512]."""
     out: Annotated[Path, arg(metavar="DIR")] = Path("runs/sweep")
-    """Folder of the runs: <task>/<system>,<setting>=<value>/seed-<seed>."""
+    """Folder for the runs: <task>/<system>,<setting>=<value>/seed-<seed>."""
     dry_run: Switch = False
-    """Only say what would be run."""
+    """Only list the runs."""
     means: Annotated[Means, OmitArgPrefixes] = field(default_factory=Means)
 
     def __post_init__(self) -> None:
@@ -82,11 +82,11 @@ def run(command: Sweep) -> int:
         return 0
     with attended_runs(command.out):
         failed = dispatch(runs, command.out, command.means, printer())
-    return exit_code(len(failed), len(runs), "run", "the same command tries again")
+    return exit_code(len(failed), len(runs), "run", "the same command tries them again")
 
 
 def grid_of(command: Sweep) -> Grid:
-    """The grid that the options describe. Raises `ConfigError` for what is none."""
+    """The grid that the options describe. Raises `ConfigError` if they describe none."""
     from metrpo.launch.grid import Grid, budget_of, require_once, seeds_of, values_of
 
     settings, budgets = [values_of(text) for text in command.set], [budget_of(text) for text in command.budget]

@@ -10,7 +10,7 @@ from metrpo.commands.options import Switch
 
 @dataclass(frozen=True)
 class Tasks:
-    """List the tasks that can be learnt.
+    """List the tasks to learn.
 
     For example:
         metrpo tasks
@@ -34,6 +34,6 @@ def run(command: Tasks) -> int:
     print(f"{'task':<17} {'states':>6} {'actions':>7} {'steps':>5}  description")
     for row in rows:
         print("{name:<17} {state_size:>6} {action_size:>7} {horizon:>5}  {description}".format(**row))
-    print(f"\nalso with their formulas: {', '.join(KNOWN)}")
-    print("and with a learned reward: any other Gymnasium id, module:name, path/to/file.py:name")
+    print(f"\nalso, with their reward formulas: {', '.join(KNOWN)}")
+    print("and, with a learned reward: any other Gymnasium id, module:name or path/to/file.py:name")
     return 0

@@ -1,4 +1,4 @@
-"""`metrpo train` learns a task, or goes on with a run."""
+"""`metrpo train` learns a task, or resumes a run."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ from metrpo.errors import MetrpoError
 from metrpo.trackers import TrackerName, trackers
 
 _log = logging.getLogger("metrpo")
-_AGAIN = "The same command would only make what is missing of its record, such as the video."
+_AGAIN = "The same command would only write the files that are missing, such as the video."
 
 
 @dataclass(frozen=True)
 class Train(RunOptions):
-    """Learn a task, or go on with a run: the same command again resumes it.
+    """Learn a task, or resume a run: the same command does both.
 
     For example:
         metrpo train Swimmer
         metrpo train HalfCheetah --seed 1 --real-steps 60000 --run-dir runs/cheetah
         metrpo train Pendulum-v1 --ensemble.members 10 --trpo.max-kl 0.02
 
-    Every setting starts from the task's preset; metrpo train --help-all lists all.
+    Every setting starts from the task's preset; metrpo train --help-all lists them all.
     """
 
     track: tuple[TrackerName, ...] = ()
-    """Log to these trackers, too (each is an extra: pip install 'metrpo[wandb]'); one that fails costs no learning."""
+    """Log to these trackers too (each is an extra: pip install 'metrpo[wandb]'); training survives one that fails."""
     video: Annotated[Switch, arg(help="Do not record the final policy as a video.")] = True
 
 
@@ -57,7 +57,7 @@ def run(command: Train) -> int:
         try:
             say_outcome(run_dir, command.video)
         except OSError as error:  # nobody reads on; the run is complete
-            _log.warning("cannot say more (%s: %s); %s is complete", type(error).__name__, error, run_dir)
+            _log.warning("cannot print the outcome (%s: %s); %s is complete", type(error).__name__, error, run_dir)
     return 0
 
 
@@ -71,7 +71,7 @@ def _is_complete(run_dir: Path, config: Config) -> bool:
 
 
 def say_outcome(run_dir: Path, video: bool) -> None:
-    """Says what the run has earned and where its files lie; a machine that cannot make a video costs the video only."""
+    """Prints the run's return and its files. Where no video can be made, prints why."""
     from metrpo.console.progress import outcome
     from metrpo.evaluation import render
     from metrpo.run.metrics import read_metrics
@@ -92,7 +92,7 @@ def say_outcome(run_dir: Path, video: bool) -> None:
 
 
 def _video_of(run_dir: Path) -> Path | None:
-    """The run's video, if there is one of its policy as it is now: the policy's file is written anew at every start."""
+    """The run's video if it shows the present policy. (The policy's file is written anew at every start.)"""
     video = run_dir / "video.mp4"
     with suppress(OSError):
         learned = max((path.stat().st_mtime_ns for path in (run_dir / "checkpoints").iterdir()), default=math.inf)

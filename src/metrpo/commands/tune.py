@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Tune:
-    """Search over settings with Optuna: trials are ordinary runs, bad ones stopped early on their real return.
+    """Search over settings with Optuna. Trials are ordinary runs; a low real return stops bad ones early.
 
-    Give several seeds: what one run earns is noise. The same command goes on. Needs: pip install 'metrpo[tune]'.
+    Give several seeds: one run's return is noisy. The same command resumes. Needs: pip install 'metrpo[tune]'.
     For example:
         metrpo tune --search "trpo.max_kl=log 0.003..0.1" ensemble.members=1,3,5
         metrpo tune --search "validate.patience=10..50 step 10" --dry-run
@@ -39,18 +39,18 @@ class Tune:
     """
 
     spec: Annotated[Positional[Path | None], arg(metavar="SPEC")] = None
-    """The search as a TOML file: task, trials, seeds, iterations or real_steps, system, preset, pruner, sampler_seed,
-    and tables [search] and [set]; instead of the options of these names."""
+    """The search as a TOML file, instead of options: task, trials, seeds, iterations or real_steps, system, preset,
+    pruner, sampler_seed, and tables [search] and [set]."""
     task: str = "Swimmer"
     """Task, as metrpo train takes it."""
     search: Annotated[tuple[str, ...], arg(metavar="NAME=RANGE...")] = ()
-    """Settings, each with its range, A..B, log A..B or A..B step C, or its choices, such as 1,3,5 or [64],[200,200]."""
+    """Settings to search, each with a range (A..B, log A..B, A..B step C) or choices (1,3,5 or [64],[200,200])."""
     set: Annotated[tuple[str, ...], arg(metavar="NAME=VALUE...")] = ()
-    """Other settings that are not the preset's."""
+    """Other settings, fixed to values that are not the preset's."""
     trials: int = 20
-    """Trials in all; may be raised later."""
+    """Trials in all. Raise it later to search on."""
     seeds: Annotated[tuple[str, ...], arg(metavar="SEEDS...")] = ("0:2",)
-    """Seeds of every trial, side by side: numbers, ranges such as 0:3 (0 to 2), or lists such as 0,2,7."""
+    """Seeds of every trial, which run in parallel: numbers, ranges such as 0:3 (0 to 2), or lists such as 0,2,7."""
     iterations: Annotated[int | None, arg(metavar="INT")] = None
     """Outer iterations of every run; default: the preset's."""
     real_steps: Annotated[int | None, arg(metavar="INT")] = None
@@ -58,20 +58,20 @@ class Tune:
     system: Annotated[System, arg(metavar="NAME")] = "me-trpo"
     """System, as metrpo train takes it."""
     preset: Preset = "fast"
-    """What all other settings start from."""
+    """The defaults of all other settings."""
     pruner: Literal["median", "halving", "none"] = "median"
-    """Stop a trial when its best return so far is below the median of the others' after as many iterations, when it is
-    not among the best third (successive halving), or never."""
+    """Stop a trial when its best return so far is below the median of the others at the same iteration (median), when
+    it is not among the best third (halving: successive halving), or never (none)."""
     sampler_seed: int = 0
-    """Decides which settings are tried."""
+    """Seed of the sampler, which chooses the settings to try."""
     jobs: Annotated[int | None, arg(metavar="INT")] = None
-    """Trials at a time, on cores of their own; default: as many as their seeds have a core each."""
+    """Trials at a time, each on its own cores; default: as many as give every seed a core."""
     out: Annotated[Path | None, arg(metavar="DIR")] = None
-    """Folder of the study, its picture and the runs: <task>/trial-<number>/seed-<seed>; default: runs/tune-<task>."""
+    """Folder for the study, its figure and the runs (trial-<number>/seed-<seed>); default: runs/tune-<task>."""
     json: Switch = False
     """Print all trials and the best one as JSON."""
     dry_run: Switch = False
-    """Only say what would be searched."""
+    """Only print the search."""
 
     def __post_init__(self) -> None:
         require_at_least_one("jobs", self.jobs)
@@ -101,11 +101,11 @@ def run(command: Tune) -> int:
     else:
         tuned.print()
         print(picture or f"{out}: nothing to draw yet")
-    return exit_code(len(tuned.failed), len(tuned.records), "trial", f"the ends of their logs stand in {out}")
+    return exit_code(len(tuned.failed), len(tuned.records), "trial", f"the ends of their logs are in {out}")
 
 
 def search_of(command: Tune) -> Search:
-    """The search that the options describe. Raises `ConfigError` for what is none, or what `Search` raises."""
+    """The search that the options describe. Raises `ConfigError` if they describe none."""
     from metrpo.launch.grid import require_once, seeds_of, values_of
     from metrpo.tune.search import Search
     from metrpo.tune.space import span_of
@@ -114,7 +114,7 @@ def search_of(command: Tune) -> Search:
     require_once("search", [name for name, _ in searched])
     require_once("set", [name for name, _ in fixed])
     if several := [name for name, values in fixed if len(values) != 1]:
-        raise ConfigError(f"set: {several[0]}: expected one value, got several; --search chooses among them")
+        raise ConfigError(f"set: {several[0]}: expected one value, got several; to choose among them, use --search")
     names = [f.name for f in dataclasses.fields(Search) if f.name not in ("space", "settings", "seeds")]
     return Search(
         **cast(Any, {name: getattr(command, name) for name in names}),

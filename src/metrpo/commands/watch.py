@@ -1,4 +1,4 @@
-"""`metrpo watch` shows where many runs stand."""
+"""`metrpo watch` shows the progress of many runs."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from metrpo.errors import ConfigError
 
 @dataclass(frozen=True)
 class Watch:
-    """Show where many runs stand, in a table that stays up to date: returns, warnings, time left, running or stopped.
+    """Show the progress of many runs in a live table: return, warnings, time left, running or stopped.
 
-    Ctrl-C ends it; the runs go on. For example:
+    Ctrl-C ends the table, not the runs. For example:
         metrpo watch runs
         metrpo watch runs/sweep runs/Swimmer-fast-seed0 --every 30
         metrpo watch runs --once
@@ -28,11 +28,11 @@ class Watch:
     dirs: Annotated[Positional[tuple[Path, ...]], arg(metavar="DIR...")]
     """Run directories, or folders with runs inside."""
     every: float = 5.0
-    """Seconds between two looks."""
+    """Seconds between two updates of the table."""
     once: Switch = False
-    """Look once."""
+    """Print the table once."""
     json: Switch = False
-    """Print JSON, once."""
+    """Print JSON once."""
 
     def __post_init__(self) -> None:
         require_directories("watch", self.dirs)

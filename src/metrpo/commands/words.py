@@ -1,4 +1,4 @@
-"""The words of a command line: lists that may be given in several ways, and what is said when they make no sense."""
+"""The words of a command line: lists in their several spellings, and the error where the words make no sense."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ _NEEDS = {
     "TASK": ("a task", "; metrpo tasks lists them"),
     "FIGURE": ("a figure", "; metrpo reproduce --help lists them"),
 }
-"""The word that a command is about -> what it is, and how to find one."""
+"""A command's positional word -> what it is, and how to find one."""
 
 
 def joined(arguments: Sequence[str], lists: Collection[str]) -> list[str]:
     """The arguments with every option among `lists` once: `--set a --set b`, `--set=a --set b` become `--set a b`."""
-    found: list[str | list[str]] = []
-    given: dict[str, list[str]] = {}
+    parts: list[str | list[str]] = []
+    values_of: dict[str, list[str]] = {}
     open_list: list[str] | None = None
     for word in arguments:
         option, equals, value = word.partition("=")
@@ -39,16 +39,16 @@ def joined(arguments: Sequence[str], lists: Collection[str]) -> list[str]:
         if word.startswith("-"):
             open_list = None
         if option in lists:
-            if option not in given:
-                given[option] = [option]
-                found.append(given[option])
-            given[option] += [value] if equals else []
-            open_list = None if equals else given[option]
+            if option not in values_of:
+                values_of[option] = [option]
+                parts.append(values_of[option])
+            values_of[option] += [value] if equals else []
+            open_list = None if equals else values_of[option]
         elif open_list is not None:
             open_list.append(word)
         else:
-            found.append(word)
-    return [word for part in found for word in (part if isinstance(part, list) else [part])]
+            parts.append(word)
+    return [word for part in parts for word in (part if isinstance(part, list) else [part])]
 
 
 def lists_of(kind: type) -> set[str]:
@@ -66,7 +66,7 @@ def _spelt(name: str, hint: object, prefix: str = "") -> list[str]:
 
 
 def command_of(arguments: Sequence[str], commands: Collection[str]) -> str:
-    """The command that is typed. Raises `ConfigError` for one that is unknown, with the one that may be meant."""
+    """The command that is typed. Raises `ConfigError` for an unknown one, and suggests the nearest."""
     word = arguments[0]
     if word in commands:
         return word
@@ -77,9 +77,9 @@ def command_of(arguments: Sequence[str], commands: Collection[str]) -> str:
 
 
 def understood(parse: Callable[[], T], kind: type, arguments: Sequence[str]) -> T:
-    """What `parse` returns; where it prints what is wrong and ends with 2, that is said in one line instead.
+    """What `parse` returns. Where it would print a complaint and exit with 2, raises `ConfigError` in one line instead.
 
-    `kind` is the command's class, `arguments` are its words. Raises `ConfigError`.
+    `kind` is the command's class, `arguments` are its words.
     """
     _require_one_budget(arguments)
     printed = io.StringIO()
@@ -97,11 +97,11 @@ def understood(parse: Callable[[], T], kind: type, arguments: Sequence[str]) -> 
 def _require_one_budget(arguments: Sequence[str]) -> None:
     options = [word.partition("=")[0].replace("_", "-") for word in arguments]
     if all(option in options for option in _BUDGET):
-        raise ConfigError(f"{arguments[0]}: give {' or '.join(_BUDGET)}, not both")
+        raise ConfigError(f"{arguments[0]}: expected {' or '.join(_BUDGET)}, got both; leave one out")
 
 
 def _needed(text: str, kind: type, arguments: Sequence[str]) -> str | None:
-    """What to type where the word that a command is about is missing, or given as an option; else None."""
+    """What to type where the command's positional word is missing, or given as an option; else None."""
     command = arguments[0]
     for name, metavar in _positionals(kind):
         if any(word.partition("=")[0] == f"--{name}" for word in arguments):
@@ -113,7 +113,7 @@ def _needed(text: str, kind: type, arguments: Sequence[str]) -> str | None:
 
 
 def _positionals(kind: type) -> Iterator[tuple[str, str]]:
-    """Name and metavar of the words of a command that belong to no option."""
+    """Name and metavar of each positional word of a command."""
     for name, hint in typing.get_type_hints(kind, include_extras=True).items():
         marks = getattr(hint, "__metadata__", ())
         if tyro.conf.Positional in marks:
@@ -121,7 +121,7 @@ def _positionals(kind: type) -> Iterator[tuple[str, str]]:
 
 
 def _complaint(text: str, kind: type, arguments: Sequence[str]) -> str:
-    """The parser's own words, a title and paragraphs between rules, in short."""
+    """The parser's complaint (a title and paragraphs between rules) in one line."""
     bare = (line.strip("│|╭╮╰╯─+- ") for line in text.splitlines())
     title, *lines = [line for line in bare if line] or ["Nothing"]
     see = f"see metrpo {arguments[0]} {_help(kind)}"
@@ -142,22 +142,22 @@ def _complaint(text: str, kind: type, arguments: Sequence[str]) -> str:
 
 
 def _given(option: str, arguments: Sequence[str]) -> str:
-    """The last words that are given for `option`."""
+    """The last words given for `option`."""
     values: list[str] = []
-    at = None
+    current = None
     for word in arguments:
         name, equals, value = word.partition("=")
         if word.startswith("--"):
-            at = name.replace("_", "-")
-            values = ([value] if equals else []) if at == option else values
-        elif at == option:
+            current = name.replace("_", "-")
+            values = ([value] if equals else []) if current == option else values
+        elif current == option:
             values.append(word)
     return " ".join(values) or "nothing"
 
 
 def options_of(kind: type, prefix: str = "") -> list[str]:
     """Every option of a command's class, as it is typed."""
-    hints, found = typing.get_type_hints(kind, include_extras=True), list[str]()
+    hints, options = typing.get_type_hints(kind, include_extras=True), list[str]()
     for field in dataclasses.fields(kind):
         hint, marks = hints[field.name], getattr(hints[field.name], "__metadata__", ())
         base = hint.__origin__ if typing.get_origin(hint) is Annotated else hint
@@ -165,12 +165,12 @@ def options_of(kind: type, prefix: str = "") -> list[str]:
             continue
         name = prefix + field.name.replace("_", "-")
         if isinstance(base, type) and dataclasses.is_dataclass(base):
-            found += options_of(base, prefix if tyro.conf.OmitArgPrefixes in marks else f"{name}.")
+            options += options_of(base, prefix if tyro.conf.OmitArgPrefixes in marks else f"{name}.")
         else:
-            found += [f"--no-{name}"] if field.default is True else _spelt(field.name, hint, prefix)
+            options += [f"--no-{name}"] if field.default is True else _spelt(field.name, hint, prefix)
             if base is bool and tyro.conf.FlagCreatePairsOff not in marks:
-                found.append(f"--{prefix}no-{name.removeprefix(prefix)}")
-    return found
+                options.append(f"--{prefix}no-{name.removeprefix(prefix)}")
+    return options
 
 
 def _unknown(kind: type, arguments: Sequence[str]) -> str:
@@ -181,8 +181,8 @@ def _unknown(kind: type, arguments: Sequence[str]) -> str:
             continue
         short = [o for o in options if o.rpartition(".")[2] == option.lstrip("-")]
         near = short[:1] or difflib.get_close_matches(option, options, 1)
-        return f"unknown option {word.partition('=')[0]}{_meant(near)} metrpo {command} {_help(kind)} lists all"
-    return f"expected fewer words that belong to no option; see metrpo {command} --help"
+        return f"unknown option {word.partition('=')[0]}{_meant(near)} metrpo {command} {_help(kind)} lists them"
+    return f"expected fewer words without an option; see metrpo {command} --help"
 
 
 def _help(kind: type) -> str:
@@ -196,7 +196,7 @@ def _meant(near: Sequence[str]) -> str:
 
 @contextlib.contextmanager
 def _wide() -> Iterator[None]:
-    """Nothing that is printed in this block is wrapped."""
+    """Output in this block is not wrapped."""
     before = os.environ.get("COLUMNS")
     os.environ["COLUMNS"] = "1000"
     try:

@@ -16,7 +16,7 @@ from metrpo.commands.options import Switch
 class Zoo:
     """List the trained policies that come with metrpo, or show the card of one.
 
-    zoo:NAME stands wherever a run directory may. For example:
+    evaluate, render and export take zoo:NAME in place of a run directory. For example:
         metrpo zoo
         metrpo zoo Snake
         metrpo evaluate zoo:Snake
@@ -25,7 +25,7 @@ class Zoo:
     """
 
     name: Annotated[Positional[str | None], arg(metavar="NAME")] = None
-    """The policy whose card is shown; default: all, a line each."""
+    """Show the card of this policy; default: list all, one per line."""
     json: Switch = False
     """Print JSON."""
 
@@ -44,7 +44,7 @@ def run(command: Zoo) -> int:
         for card in cards:
             numbers = f"{card['return']:>10.1f}{_number(card['no_skill']):>10}{card['real_steps']:>12,}"
             print(f"{card['name']:<26}{numbers}  {card['preset']}")
-        print("\nmetrpo evaluate, render and export take zoo:NAME; metrpo zoo NAME shows more")
+        print("\nmetrpo evaluate, render and export take zoo:NAME; metrpo zoo NAME shows a policy's card")
     return 0
 
 
@@ -53,7 +53,7 @@ def _lines(card: Mapping[str, Any]) -> list[str]:
     no_skill = _number(card["no_skill"])
     return [
         f"zoo:{card['name']}: a policy for {card['task']}",
-        f"  return      {card['return']:.1f} in its run's last evaluation; nothing and random actions: {no_skill}",
+        f"  return      {card['return']:.1f} in its run's last evaluation; without skill: {no_skill}",
         f"  chosen      the best of {card['chosen_of']} runs, whose mean is {card['mean_of_runs']:.1f}",
         f"  learned     from {card['real_steps']:,} real steps, {card['system']}, preset {card['preset']}",
         f"  from        {card['run']}, commit {card['commit'] or 'unknown'}, {card['created'] or 'date unknown'}",
