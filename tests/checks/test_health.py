@@ -26,7 +26,7 @@ def codes(rows, config=CONFIG):
 
 def test_a_healthy_run_has_none_at_any_length():
     assert [[c for c in examine(healthy(n), CONFIG) if c.level == "warning"] for n in range(13)] == [[]] * 13
-    assert codes(healthy(3)) == ["model-exploited"], "a note, while data are few"
+    assert codes(healthy(3)) == ["model-exploited"], "a note, on little data"
     assert [codes(healthy(n)) for n in range(6, 13)] == [[]] * 7
 
 
@@ -59,7 +59,7 @@ CASES = [
         1,
         "No real return",
     ),
-    ("unfit-dimensions", changed(2, unfit_dimensions=3), CONFIG, 2, "3 observed dimensions of an offset or a scale"),
+    ("unfit-dimensions", changed(2, unfit_dimensions=3), CONFIG, 2, "3 observed dimensions with an offset or a scale"),
     ("failed-episodes", changed(3, failed_episodes=2), CONFIG, 3, "20 real episodes left out"),
     ("std-collapsed", changed(4, mean_std=0.05), CONFIG, 4, "Standard deviation of the policy 0.05, at first 1"),
     ("policy-saturated", changed(5, saturated=0.8), CONFIG, 5, "80% of the policy's mean actions beyond the limits"),
@@ -75,8 +75,8 @@ CASES = [
     ),
     ("validation-never-stops", changed(2, updates=100), ONE_MODEL, 1, "All 100 policy updates made in each of 12"),
     ("rollouts-diverge", changed(6, diverged=0.2), CONFIG, 6, "20.0% of the imagined rollouts diverge"),
-    ("end-untrusted", changed(10, end_recall=0.1), CONFIG, 10, "10% of the real ends seen"),
-    ("end-untrusted", changed(10, end_false_alarms=0.03), CONFIG, 10, "3.0% of other steps taken for an end"),
+    ("end-untrusted", changed(10, end_recall=0.1), CONFIG, 10, "10% of the real ends predicted"),
+    ("end-untrusted", changed(10, end_false_alarms=0.03), CONFIG, 10, "3.0% of other steps mistaken for an end"),
     ("end-untrusted", changed(10, end_error=0.2), CONFIG, 10, "calibration error 20.0%"),
 ]
 

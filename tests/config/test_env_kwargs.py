@@ -36,7 +36,7 @@ def test_values_are_json_or_texts_and_have_one_spelling():
         (["=5"], "expected KEY=VALUE"),
         (["a b=5"], "expected KEY=VALUE"),
         (["g=1", "g=2"], "expected each argument once, got g twice"),
-        ({"f": print}, "env_kwargs: f: expected numbers, texts, lists or dicts of them"),
+        ({"f": print}, "env_kwargs: f: expected numbers, strings, lists or dicts of them"),
     ],
 )
 def test_what_is_no_argument_is_refused(given, message):

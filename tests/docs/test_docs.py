@@ -223,7 +223,7 @@ def test_every_setting_has_a_row_with_its_values_and_its_text():
         "0.01",
         "",
         "",
-        "Trust region: the largest mean KL divergence from the old to the new policy.",
+        "Trust region: the maximum mean KL divergence from the old to the new policy.",
     )
     assert "| Humanoid | paper | `iterations` 400" in text
 

@@ -39,9 +39,9 @@ def test_every_diagnostic_has_a_chart_and_says_how_to_read_it(tmp_path):
     found = Page(page(find([a_run(tmp_path / "a", diagnostics=details())]), tmp_path)).text
     assert all(title in found for title in TITLES)
     assert "worse than predicting no change" in found
-    assert "the policy has gone where the models guess" in found
+    assert "the policy is where the models guess" in found
     assert "a model that the others outvote" in found
-    assert "no real step has been so far out" in found
+    assert "no real step has been that far out" in found
     assert "Model error, one step" not in found, "one run is not drawn twice"
 
 

@@ -1,1 +1,1 @@
-"""Whether a run is healthy: what is read off its metrics, and what there is to say about it."""
+"""Health checks of a run: findings read off its metrics."""

@@ -1,6 +1,6 @@
-"""Whether a run is healthy, in plain words: what was measured, since when, what it means and what helps.
+"""Health checks in plain words: what was measured, since when, what it means and what helps.
 
-Pure functions from the rows of metrics.csv and the settings to a list of concerns. docs/report.md says on how many of
+Pure functions from the rows of metrics.csv and the settings to a list of findings. docs/report.md says on how many of
 the runs under results/ each one fires.
 """
 
@@ -36,19 +36,19 @@ CHECKS: tuple[Callable[[Sequence[Row], Config], Concern | None], ...] = (
     policy_checks.few_episodes,
     policy_checks.failed_episodes,
 )
-"""Extend them by adding a row."""
+"""To add a check, add a row."""
 
 
 def examine(
     rows: Sequence[Row], config: Config, yardsticks: Mapping[str, float] = MappingProxyType({})
 ) -> list[Concern]:
-    """What there is to say about a run that has these rows, warnings first; nothing where it is healthy.
+    """The findings about a run with these rows, warnings first; none where it is healthy.
 
-    `yardsticks` are the returns of ways to act that have learned nothing, by name.
+    `yardsticks` are the returns of unskilled ways to act, by name.
     """
     if not rows:
         return []
-    with np.errstate(all="ignore"):  # what is not finite has a sign of its own
-        signs = [*(check(rows, config) for check in CHECKS), policy_checks.no_skill(rows, config, yardsticks)]
-    found = [sign for sign in signs if sign is not None]
-    return sorted(found, key=lambda concern: concern.level != "warning")
+    with np.errstate(all="ignore"):  # a check of its own reports what is not finite
+        results = [*(check(rows, config) for check in CHECKS), policy_checks.no_skill(rows, config, yardsticks)]
+    concerns = [concern for concern in results if concern is not None]
+    return sorted(concerns, key=lambda concern: concern.level != "warning")

@@ -1,4 +1,4 @@
-"""Signs that the models are not to be trusted. Thresholds were set on the runs under results/ (docs/report.md)."""
+"""Findings that the models cannot be trusted. Thresholds were set on the runs under results/ (docs/report.md)."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ from metrpo.counting import counted
 from metrpo.run.metrics import Row, column
 
 EXPLOITED = 0.5
-"""Imagined above real return, in parts of the real one, mean over three iterations."""
+"""Excess of the imagined over the real return, as a fraction of the real one, mean over three iterations."""
 AVERAGED, EARLY = 3, 5
-"""Iterations of a running mean; and those in which models may promise too much."""
+"""Iterations of a running mean; and early iterations, in which models may promise too much."""
 OUTLIER = 2.0
-"""One model's validation loss over the median of the others'."""
+"""One model's validation loss divided by the median of the others'."""
 RISING = 5.0
-"""Validation loss, median of the models, over the lowest so far."""
+"""Validation loss (median of the models) divided by the lowest so far."""
 DIVERGED = 0.01
-"""Share of imagined rollouts that leave all bounds."""
+"""Share of imagined rollouts that diverge."""
 BLIND = 1.0
-"""Error of a prediction, in parts of that of predicting no change."""
+"""Error of a prediction divided by that of predicting no change."""
 LOST_ENDS, FALSE_ENDS, MISCALIBRATED = 0.5, 0.01, 0.05
-"""Learned end of an episode: share of ends seen (least), share of other steps taken for one, calibration error."""
+"""Learned end of an episode: least recall, and most false alarms and calibration error."""
 
 
 def model_exploited(rows: Sequence[Row], config: Config) -> Concern | None:
-    """The models promise far more than the policy earns, at the end: early promises are what more data is for."""
+    """The models still promise far more than the policy earns. (More data cures early promises.)"""
     if config.imagine.disagreement:
-        return None  # the promise holds the bonus for disagreement
+        return None  # the imagined return includes the bonus for disagreement
     real, gap = column(rows, "return_real"), column(rows, "gap")
     gap = np.where(np.isfinite(gap), gap, np.nan)  # what is not finite has a warning of its own
-    # Where returns pass through zero, half the way that the return has gone is the better measure.
+    # Where returns pass through zero, half of their range is the better measure.
     way = np.array([np.ptp(_finite(real[: i + 1])) for i in range(len(real))])
     scale = np.fmax(np.fmax(np.abs(real), way / 2), column(rows, "return_real_std"))
     above = np.array([_ratio(_recent(gap, i), _recent(scale, i)) for i in range(len(rows))])
@@ -45,7 +45,7 @@ def model_exploited(rows: Sequence[Row], config: Config) -> Concern | None:
     times = (
         f"{imagined / earned:.1f} times the real one"
         if earned > 0
-        else f"{short(imagined)} where {short(earned)} is real"
+        else f"{short(imagined)}, real return {short(earned)}"
     )
     members = "five models instead of one" if config.ensemble.members == 1 else "more models"
     early = len(rows) <= EARLY
@@ -54,22 +54,22 @@ def model_exploited(rows: Sequence[Row], config: Config) -> Concern | None:
         "note" if early else "warning",
         since,
         f"Imagined return {times} (mean of {AVERAGED} iterations)",
-        "the policy exploits the models' errors" + (", as most do while data are few" if early else "") + _where(rows),
-        f"{members} (ensemble.members), shorter imagined episodes (imagine.horizon) or more real steps help",
+        "the policy exploits the models' errors" + (", as most do on little data" if early else "") + _where(rows),
+        f"try {members} (ensemble.members), shorter imagined episodes (imagine.horizon) or more real steps",
     )
 
 
 def _where(rows: Sequence[Row]) -> str:
-    """What else was measured of the last models, as the end of a sentence; nothing of a run from before that."""
+    """Other measurements of the last models, as the end of a sentence; empty for runs from before these."""
     outside = column(rows, "outside")[-1]
-    said = [f"{outside:.0%} of the imagined states lie outside the data"] if outside > 0 else []
+    parts = [f"{outside:.0%} of the imagined states lie outside the data"] if outside > 0 else []
     far = next((k for k in horizons(rows) if column(rows, f"error_{k}")[-1] > BLIND), None)
-    said += [f"after {after(far)} predictions are worse than no change"] if far is not None else []
-    return f" ({', and '.join(said)})" if said else ""
+    parts += [f"after {after(far)} predictions are worse than no change"] if far is not None else []
+    return f" ({', and '.join(parts)})" if parts else ""
 
 
 def models_blind(rows: Sequence[Row], config: Config) -> Concern | None:
-    """Whoever predicts that nothing changes is nearer to the real next state than the models are."""
+    """Predicting no change comes nearer to the real next state than the models do."""
     error = column(rows, "error_1")
     since = since_when(rows, error > BLIND)
     if since is None or since > iteration_at(rows, -2):
@@ -79,14 +79,14 @@ def models_blind(rows: Sequence[Row], config: Config) -> Concern | None:
         "warning",
         since,
         f"Model error {short(error[-1])} times that of predicting no change, after a single step on held-out episodes",
-        "the models know nothing of what an action does, so that the policy learns in a world of its own",
-        "a look at the data first (do state, action and next state belong together? are there outliers?), then longer "
-        "fitting (fit.max_passes, fit.patience) or a smaller fit.learning_rate",
+        "the models do not know what an action does, so the policy learns in a world of its own",
+        "check the data first (do state, action and next state belong together? are there outliers?), then fit longer "
+        "(fit.max_passes, fit.patience) or lower fit.learning_rate",
     )
 
 
 def unfit_dimensions(rows: Sequence[Row], config: Config) -> Concern | None:
-    """Observations have an offset or a scale in which what a step changes is lost."""
+    """Some observations have an offset or a scale that hides the change of one step."""
     dimensions = column(rows, "unfit_dimensions")
     since = since_when(rows, dimensions > 0)
     if since is None:
@@ -95,10 +95,10 @@ def unfit_dimensions(rows: Sequence[Row], config: Config) -> Concern | None:
         "unfit-dimensions",
         "warning",
         since,
-        f"{counted(int(dimensions[-1]), 'observed dimension')} of an offset or a scale that cannot be learned from",
+        f"{counted(int(dimensions[-1]), 'observed dimension')} with an offset or a scale that cannot be learned from",
         "float32, the bounds of imagination or the scales of policy and models hide how these change",
-        "the first iteration of metrpo train names them and says what to do; give differences from something near, or "
-        "another unit",
+        "observe differences from something near, or change the unit; the first iteration of metrpo train names the "
+        "dimensions and the cure",
     )
 
 
@@ -118,8 +118,8 @@ def member_apart(rows: Sequence[Row], config: Config) -> Concern | None:
         "warning",
         since,
         f"Validation loss of model {k} is {short(losses[-1, k])}, {ratio[-1, k]:.1f} times the others' median",
-        "one model of the ensemble is badly fitted, and every imagined step may fall to it",
-        "longer fitting (fit.patience, fit.max_passes), a smaller fit.learning_rate, or fresh weights more often "
+        "one model of the ensemble is badly fitted, and any imagined step may use it",
+        "fit longer (fit.patience, fit.max_passes), lower fit.learning_rate, or start from fresh weights more often "
         "(fit.reinitialise_every)",
     )
 
@@ -139,15 +139,15 @@ def loss_rises(rows: Sequence[Row], config: Config) -> Concern | None:
         "note",
         since,
         f"Validation loss {short(middle[-1])}, {times[-1]:.1f} times its lowest",
-        "the policy goes where the models know little, or fitting breaks off too soon",
-        "longer fitting (fit.patience, fit.max_passes), larger models (ensemble.hidden), more collect.steps",
+        "the policy visits states that the models know little about, or fitting stops too soon",
+        "fit longer (fit.patience, fit.max_passes), use larger models (ensemble.hidden), raise collect.steps",
     )
 
 
 def not_finite(rows: Sequence[Row], config: Config) -> Concern | None:
-    """What should be a number is none."""
+    """A loss, a return or a KL divergence is not finite."""
     names = [n for n in rows[0] if n.startswith("validation_loss_") or n in ("return_imagined", "train_loss", "kl")]
-    # An empty cell is what a method does not measure.
+    # A cell is empty where a method does not measure it.
     bad = [[n for n in names if row.get(n) is not None and not math.isfinite(row[n] or 0.0)] for row in rows]
     since = since_when(rows, np.array([bool(b) for b in bad]))
     if since is None:
@@ -157,13 +157,13 @@ def not_finite(rows: Sequence[Row], config: Config) -> Concern | None:
         "warning",
         since,
         f"{', '.join(bad[-1][:3])} {'is not a finite number' if len(bad[-1]) == 1 else 'are not finite numbers'}",
-        "a model or the policy has left all bounds",
-        "try a smaller fit.learning_rate, or rescale rewards and observations to about 1",
+        "a model or the policy has diverged",
+        "lower fit.learning_rate, or rescale rewards and observations to about 1",
     )
 
 
 def diverged(rows: Sequence[Row], config: Config) -> Concern | None:
-    """Imagined rollouts leave all bounds."""
+    """Imagined rollouts diverge."""
     share = column(rows, "diverged")
     since = since_when(rows, share > DIVERGED)
     if since is None:
@@ -173,27 +173,27 @@ def diverged(rows: Sequence[Row], config: Config) -> Concern | None:
         "warning",
         since,
         f"{share[-1]:.1%} of the imagined rollouts diverge",
-        "the models blow up on their own predictions, and the policy learns from what is left",
-        "shorter imagined episodes (imagine.horizon), more models, a smaller collect.max_std",
+        "the models blow up on their own predictions, and the policy learns from the rest",
+        "shorten imagined episodes (imagine.horizon), add models (ensemble.members), lower collect.max_std",
     )
 
 
 def end_untrusted(rows: Sequence[Row], config: Config) -> Concern | None:
-    """The learned end of an episode is not where the real one is."""
+    """Learned ends of episodes differ from real ones."""
     recall, alarms, error = (column(rows, f"end_{name}") for name in ("recall", "false_alarms", "error"))
     since = since_when(rows, (recall < LOST_ENDS) | (alarms > FALSE_ENDS) | (error > MISCALIBRATED))
     if since is None:
         return None
-    said = [f"{recall[-1]:.0%} of the real ends seen"] if recall[-1] < LOST_ENDS else []
-    said += [f"{alarms[-1]:.1%} of other steps taken for an end"] if alarms[-1] > FALSE_ENDS else []
-    said += [f"calibration error {error[-1]:.1%}"] if error[-1] > MISCALIBRATED else []
+    parts = [f"{recall[-1]:.0%} of the real ends predicted"] if recall[-1] < LOST_ENDS else []
+    parts += [f"{alarms[-1]:.1%} of other steps mistaken for an end"] if alarms[-1] > FALSE_ENDS else []
+    parts += [f"calibration error {error[-1]:.1%}"] if error[-1] > MISCALIBRATED else []
     return Concern(
         "end-untrusted",
         "warning",
         since,
-        f"Learned end of episodes on held-out steps: {', '.join(said)}",
-        "imagined episodes end where real ones do not, or go on after them",
-        "give the task its formula (terminated=), or collect more episodes that end",
+        f"Learned end of episodes on held-out steps: {', '.join(parts)}",
+        "imagined episodes end earlier or later than real ones",
+        "give the task a formula (terminated=), or collect more episodes that end",
     )
 
 

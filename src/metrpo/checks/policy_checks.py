@@ -1,4 +1,4 @@
-"""Signs that the policy does not get better. Thresholds were set on the runs under results/ (docs/report.md)."""
+"""Findings that the policy does not improve. Thresholds were set on the runs under results/ (docs/report.md)."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from metrpo.counting import counted
 from metrpo.run.metrics import Row, column
 
 FELL = 0.25
-"""Return below its best, in parts of the way from its worst to its best, means over two iterations."""
+"""Drop of the return below its best, as a fraction of its range, means over two iterations."""
 COLLAPSED = 0.1
-"""Standard deviation of the policy, in parts of the initial one."""
+"""Standard deviation of the policy, as a fraction of the initial one."""
 STILL = 0.02
-"""KL divergence of an update, in parts of the trust region."""
+"""KL divergence of an update, as a fraction of the trust region."""
 REJECTED = 0.5
 """Share of the updates that moved nothing."""
 SATURATED = 0.5
 """Share of the mean actions beyond the limits."""
 SOON = 5
-"""Iterations in which a policy need not be better than none."""
+"""Early iterations, in which a policy may earn less than no skill."""
 NEVER_ACCEPTED, NEVER_STOPPED, FLAT = 3, 8, 5
-"""Iterations without an accepted update; up to max_updates; before a first gain is missed."""
+"""Iterations without an accepted update; that reach max_updates; without a first gain."""
 LAST, FEW = 10, 5
-"""So many of the last iterations, and so many of these without an accepted update."""
+"""How many of the last iterations to look at, and how many of them may lack an accepted update."""
 
 
 def return_fell(rows: Sequence[Row], config: Config) -> Concern | None:
@@ -41,9 +41,7 @@ def return_fell(rows: Sequence[Row], config: Config) -> Concern | None:
         return None
     low = pairs[best] - FELL * way
     after = f"after {short(pairs[best])} around iteration {int(iteration_at(rows, best))} (means of two)"
-    models = (
-        "its models no longer tell a better from a worse one where it goes" if "gap" in rows[0] else "see its video"
-    )
+    models = "its models no longer tell better from worse where it goes" if "gap" in rows[0] else "see its video"
     since = since_when(rows, np.append(False, (np.arange(len(pairs)) > best) & (pairs < low))) or int(
         iteration_at(rows, -1)
     )
@@ -52,16 +50,16 @@ def return_fell(rows: Sequence[Row], config: Config) -> Concern | None:
         "warning",
         since,
         f"Return {short(pairs[-1])}, {after}",
-        f"the policy has unlearnt ({models})",
-        "evaluate an earlier policy, or more models (ensemble.members), a smaller step (trpo.max_kl), more real steps",
+        f"the policy has unlearned ({models})",
+        "use an earlier policy, or try more models (ensemble.members), smaller steps (trpo.max_kl), more real steps",
     )
 
 
 def not_evaluated(rows: Sequence[Row], config: Config) -> Concern | None:
-    """The evaluation fails. Without an environment there is none, by right."""
+    """The evaluation fails. (A task without an environment rightly has none.)"""
     real, failed = column(rows, "return_real"), column(rows, "failed_evaluation")
     since = since_when(rows, ~np.isfinite(real))
-    # Rows from before that column do not say why there is none.
+    # Rows from before that column do not say why there is no return.
     has_environment = np.isfinite(real).any() or (failed == 1).any() or config.method != "model-based"
     if since is None or not has_environment:
         return None
@@ -70,13 +68,13 @@ def not_evaluated(rows: Sequence[Row], config: Config) -> Concern | None:
         "warning",
         since,
         "No real return",
-        "the environment failed in the policy's evaluation, or gave rewards that are not finite; learning goes on",
-        "metrpo evaluate DIR says where; end an episode before the simulation diverges",
+        "the environment failed in the policy's evaluation, or gave rewards that are not finite; learning continues",
+        "run metrpo evaluate DIR to see where; end an episode before the simulation diverges",
     )
 
 
 def failed_episodes(rows: Sequence[Row], config: Config) -> Concern | None:
-    """The environment fails in some episodes, of which nothing is learned."""
+    """The environment fails in some episodes, which are left out of learning."""
     failed = column(rows, "failed_episodes")
     if not np.nansum(failed):
         return None
@@ -86,13 +84,13 @@ def failed_episodes(rows: Sequence[Row], config: Config) -> Concern | None:
         "note",
         int(iteration_at(rows, first)),
         f"{int(np.nansum(failed))} real episodes left out",
-        "the environment failed in them (NaN, infinity, an exception), so that nothing is learned from where it does",
+        "the environment failed in them (NaN, infinity, an exception), so nothing is learned about where it fails",
         "end an episode before the simulation diverges, or repair the environment",
     )
 
 
 def no_improvement(rows: Sequence[Row], config: Config) -> Concern | None:
-    """Nothing after the first iteration is better than it."""
+    """No iteration is better than the first."""
     real, error = column(rows, "return_real"), standard_error(rows, config)
     if len(real) < FLAT or not np.isfinite(real).all() or real[1:].max() > real[0] + 2 * error[0]:
         return None
@@ -101,14 +99,14 @@ def no_improvement(rows: Sequence[Row], config: Config) -> Concern | None:
         "warning",
         int(iteration_at(rows, 0)),
         f"No return above the first one, {short(real[0])}, in {counted(len(real), 'iteration')}",
-        "the task was solved at once, or nothing is learnt",
-        "look at the video; if it fails, more exploration (collect.max_std), more real steps an iteration "
-        "(collect.steps), or a reward that says more",
+        "the task was solved at once, or nothing is learned",
+        "watch the video; if the policy fails, explore more (collect.max_std), collect more real steps an iteration "
+        "(collect.steps), or give a more informative reward",
     )
 
 
 def no_skill(rows: Sequence[Row], config: Config, yardsticks: Mapping[str, float]) -> Concern | None:
-    """The policy earns no more than one that has learned nothing."""
+    """The policy earns no more than one without skill."""
     real = column(rows, "return_real")
     if not yardsticks or not np.isfinite(real[-1]):
         return None
@@ -120,40 +118,40 @@ def no_skill(rows: Sequence[Row], config: Config, yardsticks: Mapping[str, float
         "no-skill",
         "note" if len(rows) < SOON else "warning",
         since,
-        f"Return {short(real[-1])}, where {name} earns {short(best)}",
-        "the policy is worth less than none",
-        "look at its video and at the gap; more real steps, another seed, or a reward that says more",
+        f"Return {short(real[-1])}, while {name} earns {short(best)}",
+        "the policy is no better than none",
+        "look at its video and at the gap; try more real steps, another seed, or a more informative reward",
     )
 
 
 def few_episodes(rows: Sequence[Row], config: Config) -> Concern | None:
-    """The return is known less well than it has changed."""
+    """The error of the return is larger than its change."""
     real, error = column(rows, "return_real"), standard_error(rows, config)
     if len(real) < 3 or not np.isfinite(real).all():
         return None
     typical, progress = float(np.median(error)), float(real.max() - real[0])
-    # A policy that never varies has no error, and one episode has none that is known.
+    # A policy that never varies has no error; of one episode, the error is unknown.
     known = config.evaluation_episodes > 1
     if known and (typical == 0 or typical <= progress):
         return None
     measured = (
-        f"Standard error of the return {short(typical)}, its gain so far {short(progress)}"
+        f"Standard error of the return {short(typical)}, gain so far {short(progress)}"
         if known
-        else "One real episode an evaluation"
+        else "One real episode per evaluation"
     )
     return Concern(
         "few-evaluation-episodes",
         "note",
         int(iteration_at(rows, 0)),
         measured,
-        "whether the policy gets better cannot be seen",
-        f"more evaluation episodes than {config.evaluation_episodes} (evaluation_episodes; they teach nothing and cost "
-        "no real steps of the budget), or metrpo evaluate --episodes 100",
+        "the noise hides whether the policy improves",
+        f"evaluate on more episodes than {config.evaluation_episodes} (evaluation_episodes; they cost no real steps of "
+        "the budget), or run metrpo evaluate --episodes 100",
     )
 
 
 def std_collapsed(rows: Sequence[Row], config: Config) -> Concern | None:
-    """The policy hardly tries anything any more."""
+    """The policy hardly explores any more."""
     if config.method == "ddpg":
         return None  # its noise is not the policy's
     std = column(rows, "mean_std")
@@ -162,16 +160,16 @@ def std_collapsed(rows: Sequence[Row], config: Config) -> Concern | None:
         return None
     return Concern(
         "std-collapsed",
-        "warning" if config.method == "model-based" else "note",  # there it starts anew in every iteration
+        "warning" if config.method == "model-based" else "note",  # only there does it start anew in every iteration
         since,
         f"Standard deviation of the policy {short(std[-1])}, at first {short(config.policy.initial_std)}",
-        "the policy tries hardly anything new, so that its gradient says little",
-        "fewer updates an iteration (validate.max_updates), a smaller trpo.max_kl, a larger policy.initial_std",
+        "the policy hardly explores, so its gradient says little",
+        "make fewer updates an iteration (validate.max_updates), lower trpo.max_kl, raise policy.initial_std",
     )
 
 
 def saturated(rows: Sequence[Row], config: Config) -> Concern | None:
-    """Most mean actions lie beyond the limits, where they are clipped and have no gradient."""
+    """Most mean actions lie beyond the limits; clipped, they have no gradient."""
     share = column(rows, "saturated")
     since = since_when(rows, share > SATURATED)
     if since is None:
@@ -181,13 +179,13 @@ def saturated(rows: Sequence[Row], config: Config) -> Concern | None:
         "warning",
         since,
         f"{share[-1]:.0%} of the policy's mean actions beyond the limits",
-        "clipped actions have no gradient: the policy may stay in a local optimum",
-        "policy.normalise, a larger policy.mean_penalty, a wider policy.initial_std",
+        "clipped actions have no gradient: the policy may be stuck in a local optimum",
+        "set policy.normalise, raise policy.mean_penalty, raise policy.initial_std",
     )
 
 
 def updates_rejected(rows: Sequence[Row], config: Config) -> Concern | None:
-    """The optimiser moves the policy not at all, or hardly."""
+    """The optimiser hardly moves the policy, or not at all."""
     updates, rejected, kl = (column(rows, name) for name in ("updates", "rejected_steps", "kl"))
     share = rejected / np.fmax(updates, 1)
     trust = config.trpo.max_kl if "trpo" in (config.method, config.improver) else 0.0
@@ -202,12 +200,12 @@ def updates_rejected(rows: Sequence[Row], config: Config) -> Concern | None:
         since,
         measured,
         "the policy does not move: its gradient is noise, zero or not finite",
-        "more imagined steps an update (imagine.steps), more trpo.damping, and a reward that varies",
+        "use more imagined steps an update (imagine.steps), more trpo.damping, or a reward that varies",
     )
 
 
 def nothing_accepted(rows: Sequence[Row], config: Config) -> Concern | None:
-    """The models agree on no better policy."""
+    """The models do not agree on any better policy."""
     nothing = column(rows, "accepted_updates") == 0
     since = since_when(rows, nothing)
     if since is not None and (count := int(iteration_at(rows, -1)) - since + 1) >= NEVER_ACCEPTED:
@@ -221,26 +219,26 @@ def nothing_accepted(rows: Sequence[Row], config: Config) -> Concern | None:
         "note",
         since,
         measured,
-        "the policy stays as it is: the models see nothing better, or do not agree on it",
-        "if the return is good, the run has converged; if not, more real steps, a longer validate.patience or a lower "
-        "validate.threshold",
+        "the policy stays the same: the models see no improvement, or do not agree on one",
+        "if the return is good, the run has converged; if not, try more real steps, a longer validate.patience or a "
+        "lower validate.threshold",
     )
 
 
 def never_stopped(rows: Sequence[Row], config: Config) -> Concern | None:
-    """Validation never says stop, so that nothing guards the policy against the models' errors."""
+    """Validation never stops the policy, so nothing guards it against the models' errors."""
     if config.method != "model-based" or config.validate.rule == "no_early":
         return None
     since = since_when(rows, column(rows, "updates") >= config.validate.max_updates)
     if since is None or (count := int(iteration_at(rows, -1)) - since + 1) < NEVER_STOPPED:
         return None
     judge = "the one model judges itself and" if config.ensemble.members == 1 else "the models"
-    members = "five models (ensemble.members)" if config.ensemble.members == 1 else "a larger validate.max_updates"
+    cure = "use five models (ensemble.members)" if config.ensemble.members == 1 else "raise validate.max_updates"
     return Concern(
         "validation-never-stops",
         "warning" if config.ensemble.members == 1 else "note",
         since,
         f"All {counted(config.validate.max_updates, 'policy update')} made in each of {counted(count, 'iteration')}",
         f"{judge} never stop{'s' if config.ensemble.members == 1 else ''} the policy",
-        f"{members}; an imagined return far above the real one says that the stop is needed",
+        f"{cure}; an imagined return far above the real one says that the stop is needed",
     )

@@ -20,7 +20,7 @@ def overview() -> str:
         for i, (name, text) in enumerate(commands.items()):
             lines.append(f"{purpose if i == 0 else '':<14}{name:<11}{text}")
     lines += ["", 'Start with: metrpo train Swimmer. "metrpo COMMAND --help" explains a command,']
-    return "\n".join([*lines, '"metrpo train --help-all" lists every setting, "metrpo --version" prints the version.'])
+    return "\n".join([*lines, '"metrpo train --help-all" lists every setting, "metrpo --version" the version.'])
 
 
 def shown(kind: Any, default: Any, only: Collection[str] | None = None) -> tuple[Any, Any]:

@@ -1,4 +1,4 @@
-"""What the settings are held against when a config is made."""
+"""Checks of the settings when a config is created."""
 
 from __future__ import annotations
 

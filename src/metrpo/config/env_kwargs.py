@@ -1,4 +1,4 @@
-"""Keyword arguments of an environment as a setting: texts KEY=VALUE, whose value is JSON, or a text as it stands."""
+"""Keyword arguments of an environment as a setting: strings KEY=VALUE, where VALUE is JSON or a plain string."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ _PYTHONS = {"True": True, "False": False, "None": None}
 """Words that Python users type for JSON's."""
 
 
-def canonical(given: Iterable[str] | Mapping[str, Any]) -> tuple[str, ...]:
-    """The keyword arguments by name, each written in one way: equal arguments are equal texts.
+def canonical(arguments: Iterable[str] | Mapping[str, Any]) -> tuple[str, ...]:
+    """The keyword arguments, sorted and each written in one way, so that equal arguments are equal strings.
 
-    Raises `ConfigError` for what is no KEY=VALUE, a key that is no Python name, or one that is given twice.
+    Raises `ConfigError` for what is no KEY=VALUE, a key that is no Python name, or a repeated key.
     """
-    if isinstance(given, Mapping):
-        pairs = [(str(key), value) for key, value in given.items()]
+    if isinstance(arguments, Mapping):
+        pairs = [(str(key), value) for key, value in arguments.items()]
     else:
-        pairs = [_pair(text) for text in given]
+        pairs = [_pair(text) for text in arguments]
     if twice := [key for i, (key, _) in enumerate(pairs) if key in dict(pairs[:i])]:
         raise ConfigError(f"env_kwargs: expected each argument once, got {twice[0]} twice; leave one out")
     return tuple(sorted(f"{key}={_text(key, value)}" for key, value in pairs))
@@ -49,10 +49,10 @@ def _value(text: str) -> Any:
 
 
 def _text(key: str, value: Any) -> str:
-    """The value as `_value` reads it: JSON, and a text that could not be taken for JSON as it stands."""
+    """The value as `_value` reads it: JSON, or the plain string where it cannot be mistaken for JSON."""
     if isinstance(value, str) and _value(value) == value and isinstance(_value(value), str):
         return value
     try:
         return json.dumps(value, sort_keys=True)
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"env_kwargs: {key}: expected numbers, texts, lists or dicts of them ({error})") from None
+        raise ConfigError(f"env_kwargs: {key}: expected numbers, strings, lists or dicts of them ({error})") from None

@@ -1,7 +1,7 @@
 """Every setting of a run: frozen dataclasses of numbers, strings and tuples.
 
-The defaults are the paper's values (its appendix A.1) or, where it is silent, its authors' settings;
-`metrpo.presets` holds what differs from task to task and the `fast` preset.
+The defaults are the paper's values (its appendix A.1) or, where it is silent, its authors' settings.
+`metrpo.presets` holds the values of single tasks and the `fast` preset.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ class CollectConfig:
     """Collecting real transitions (paper, appendix A.1.1)."""
 
     steps: int = 3000
-    """Real steps per outer iteration, at least: whole episodes are played until this many are reached."""
+    """Minimum number of real steps per outer iteration; the last episode is played to its end."""
     max_std: float = 3.0
-    """Exploration noise: the standard deviation is max_std times a draw from U[0, 1] raised to std_power."""
+    """Exploration noise: its standard deviation is max_std times a draw from U[0, 1] raised to std_power."""
     std_power: float = 1.0
-    """1: any standard deviation is as likely (the paper). More: most are small, and now and then one is large."""
+    """1: every standard deviation is equally likely (the paper). Larger: most are small, a few are large."""
     std_per: Literal["episode", "step"] = "episode"
-    """How often that standard deviation is drawn: once an episode (the paper) or at every step (authors' code)."""
+    """How often to draw that standard deviation: once an episode (the paper) or at every step (authors' code)."""
     noise_correlation: float = 0.0
     """Correlation of the noise from one step to the next, at least 0 and below 1: with 0 each step's noise is
     independent (the paper); with 0.9 it keeps its direction for some ten steps, and so moves a body further."""
     parameter_noise: float = 3.0
     """Scale of the parameter noise: std = scale * |policy - previous policy|, redrawn every episode; 0: none."""
     validation_fraction: float = 1 / 3
-    """Share of the new episodes that goes to the validation set."""
+    """Fraction of the new episodes that goes to the validation set."""
     max_train: int = 200_000
-    """Most transitions kept for training; the oldest go first."""
+    """Maximum number of transitions kept for training; the oldest go first."""
     max_validation: int = 100_000
-    """Most transitions kept for validation; the oldest go first."""
+    """Maximum number of transitions kept for validation; the oldest go first."""
 
     def __post_init__(self) -> None:
         require(self.steps >= 1, "collect.steps", self.steps, "at least 1")
@@ -69,9 +69,9 @@ class EnsembleConfig:
     hidden: tuple[int, ...] = (1024, 1024)
     """Sizes of the hidden layers (ReLU)."""
     std_floor: float = 0.1
-    """Smallest standard deviation of states and actions that the normaliser divides by."""
+    """The normaliser divides states and actions by their standard deviation, but at least by this."""
     delta_std_floor: float = 0.1
-    """Smallest standard deviation of the change of state that the normaliser multiplies the output by."""
+    """The normaliser multiplies outputs by the standard deviation of state changes, but at least by this."""
 
     def __post_init__(self) -> None:
         require(self.members >= 1, "ensemble.members", self.members, "at least 1")
@@ -89,21 +89,22 @@ class FitConfig:
     weight_decay: float = 0.0
     """Decoupled weight decay (AdamW): each step shrinks weights, not biases, by learning_rate * weight_decay."""
     batch_size: int = 1000
-    """Transitions per minibatch, drawn with replacement and for each model independently."""
+    """Transitions per minibatch, drawn with replacement, independently for each model."""
     loss_units: Literal["raw", "std"] = "raw"
-    """Units of the squared error, summed over state dimensions: raw state units (the paper), or each one's std."""
+    """Units of the squared error, summed over state dimensions: raw units (the paper), or each dimension's std."""
     products: Literal["float32", "bfloat16"] = "float32"
-    """Type of the matrix products' operands, and so of the weights' gradients; sums and Adam stay float32."""
+    """Type of the operands of matrix products, and so of the weights' gradients; sums and Adam stay float32."""
     validate_every: int = 5
-    """Passes over the training set between two validations."""
+    """Epochs between two validations."""
     patience: int = 25
-    """Stop when no model has improved its validation loss for this many passes."""
+    """Stop when no model has improved its validation loss for this many epochs."""
     max_passes: int = 2000
-    """Most passes over the training set in one outer iteration."""
+    """Maximum number of epochs in one outer iteration."""
     max_steps: int | None = None
-    """Most minibatches in one outer iteration, whatever the size of the training set; with a warm start they add up."""
+    """Maximum number of minibatches in one outer iteration. Warm starts carry training on across iterations."""
     reinitialise_every: int = 5
-    """Fresh weights in every n-th outer iteration (1, 1+n, ...), warm start in the others; 0: only in the first."""
+    """Start from fresh weights in every n-th outer iteration (1, 1+n, ...), else from the last ones; 0: fresh only in
+    the first."""
 
     def __post_init__(self) -> None:
         require(positive(self.learning_rate), "fit.learning_rate", self.learning_rate, "a finite number > 0")
@@ -121,18 +122,18 @@ class ImagineConfig:
     steps: int = 50_000
     """Imagined steps per policy update (TRPO's batch)."""
     sampling: Literal["step_rand", "model_mean_std", "model_mean", "model_med", "eps_rand", "one_model"] = "step_rand"
-    """How the next state comes out of the ensemble: of a model drawn per step (step_rand) or per episode (eps_rand), of
-    the first model, the models' mean or median, or drawn from a normal distribution fitted to them."""
+    """Where the next state comes from: a model drawn per step (step_rand) or per episode (eps_rand), the first model
+    (one_model), the models' mean or median, or a normal distribution fitted to them (model_mean_std)."""
     start: Literal["dataset", "anywhere", "reset"] = "dataset"
-    """Start states of imagined episodes: those of real episodes in the dataset, any state of the training set, or fresh
-    real resets (uncounted)."""
+    """Start states of imagined episodes: those of real episodes (dataset), any state of the training set (anywhere), or
+    fresh real resets (reset; not counted)."""
     horizon: int | None = None
-    """Steps of an imagined episode, fewer than the task's: what would follow is valued by the baseline, then without
-    regard to time. Needs advantage.discount < 1; goes with start = "anywhere". None: the task's."""
+    """Steps of an imagined episode, if shorter than the task's: the baseline values what would follow, without regard
+    to time. Needs advantage.discount < 1; goes with start = "anywhere". None: the task's."""
     products: Literal["float32", "bfloat16"] = "float32"
-    """Type of the operands of the ensemble's matrix products, in imagination and in validation."""
+    """Type of the operands of the ensemble's matrix products in imagination and validation."""
     disagreement: float = 0.0
-    """Added to every imagined reward: this times how far the models' predictions spread, in each dimension's std."""
+    """Bonus in every imagined reward: this times the spread of the models' predictions, in each dimension's std."""
 
     def __post_init__(self) -> None:
         require(self.steps >= 1, "imagine.steps", self.steps, "at least 1")
@@ -147,15 +148,15 @@ class PolicyConfig:
     hidden: tuple[int, ...] = (32, 32)
     """Sizes of the hidden layers (tanh)."""
     initial_std: float = 1.0
-    """Standard deviation at the start of every policy phase."""
+    """Standard deviation of the actions at the start of every policy phase."""
     normalise: bool = False
-    """Let the policy see states normalised by the dataset, and not the dimensions that the models do not see."""
+    """Normalise the policy's states by the dataset, and hide the dimensions that the models do not see."""
     min_std: float = 0.0
-    """Above 0: the standard deviation goes on from phase to phase and is at least this where one starts; 0: every phase
-    starts from initial_std (the paper)."""
+    """0: every phase starts from initial_std (the paper). Above 0: a phase starts from the last one's standard
+    deviation, but at least from this."""
     mean_penalty: float = 0.0
-    """Taken from the surrogate of trpo, ppo and vpg: this times the squared excess of mean actions beyond 0.9, over the
-    standard deviation."""
+    """Penalty in the surrogate of trpo, ppo and vpg: this times the squared excess of mean actions beyond 0.9, divided
+    by the standard deviation."""
 
     def __post_init__(self) -> None:
         require(all(n >= 1 for n in self.hidden), "policy.hidden", self.hidden, "sizes of at least 1")
@@ -169,7 +170,7 @@ class AdvantageConfig:
     """Advantages and their baseline (authors' settings: no discount, lambda 1, linear features)."""
 
     baseline: Literal["linear", "network"] = "linear"
-    """What values a state: linear features, fitted afresh to every batch, or a network that goes on learning."""
+    """The baseline: linear features, fitted afresh to every batch, or a network that keeps learning."""
 
     discount: float = 1.0
     """gamma."""
@@ -180,7 +181,7 @@ class AdvantageConfig:
     value_hidden: tuple[int, ...] = (64, 64)
     """Sizes of the value network's hidden layers (tanh)."""
     value_steps: int = 40
-    """Minibatches that the value network learns from after every policy update."""
+    """Minibatches of the value network after every policy update."""
     value_batch_size: int = 1000
     """Imagined steps per minibatch of the value network."""
     value_learning_rate: float = 1e-3
@@ -203,17 +204,17 @@ class TRPOConfig:
     """The trust-region step (Schulman et al. 2015; step size from the paper, appendix A.1.3)."""
 
     max_kl: float = 0.01
-    """Trust region: the largest mean KL divergence from the old to the new policy."""
+    """Trust region: the maximum mean KL divergence from the old to the new policy."""
     cg_iterations: int = 10
     """Conjugate-gradient iterations."""
     fisher_every: int = 1
-    """Average the Fisher matrix over every n-th step of the batch only (Schulman et al. 2015, appendix C)."""
+    """Average the Fisher matrix over only every n-th step of the batch (Schulman et al. 2015, appendix C)."""
     damping: float = 1e-5
     """Added to the Fisher matrix's diagonal."""
     backtrack_ratio: float = 0.8
     """The line search tries backtrack_ratio^i of the full step, i = 0, 1, ..."""
     max_backtracks: int = 15
-    """Tries of the line search; when all fail the update is rejected."""
+    """Steps of the line search; if all fail, the update is rejected."""
 
     def __post_init__(self) -> None:
         require(positive(self.max_kl), "trpo.max_kl", self.max_kl, "a finite number > 0")
@@ -233,7 +234,7 @@ class GradientConfig:
     learning_rate: float = 3e-4
     """Adam's step size."""
     max_norm: float = 10.0
-    """A gradient longer than this is shortened to it (for SVG: the paper, appendix A.2.1)."""
+    """Clip gradients to this norm (for SVG: the paper, appendix A.2.1)."""
 
     def __post_init__(self) -> None:
         require(positive(self.learning_rate), "gradient.learning_rate", self.learning_rate, "a finite number > 0")
@@ -245,11 +246,11 @@ class PPOConfig:
     """Proximal policy optimization on imagined steps (Schulman et al. 2017), for `improver = "ppo"`."""
 
     clip: float = 0.2
-    """Probability ratios beyond 1 +- clip earn nothing more."""
+    """Clip probability ratios to 1 +- clip."""
     epochs: int = 10
-    """Passes over the batch per policy update."""
+    """Epochs over the batch per policy update."""
     minibatches: int = 32
-    """Parts that the batch is cut into in every pass, one gradient step each."""
+    """Minibatches per epoch, one gradient step each."""
 
     def __post_init__(self) -> None:
         require(0 < self.clip < 1, "ppo.clip", self.clip, "between 0 and 1, both excluded")
@@ -262,9 +263,10 @@ class SVGConfig:
     """Stochastic value gradients (Heess et al. 2015), for `method = "svg"`."""
 
     horizon: Literal["inf", "1"] = "inf"
-    """SVG(inf): through the model along the whole real episode; SVG(1): through one step, then a learned value."""
+    """SVG(inf): gradients through the model along the whole real episode; SVG(1): through one step, then a learned
+    value."""
     model_steps: int = 200
-    """Minibatches after every episode, from all data so far."""
+    """Minibatches of the model after every episode, from all data so far."""
     value_steps: int = 50
     """SVG(1): gradient steps of the value network after every episode, on that episode's returns."""
     value_learning_rate: float = 1e-3
@@ -282,21 +284,22 @@ class ValidateConfig:
     """When to stop improving the policy (paper, section 5, "Policy validation")."""
 
     rule: Literal["ensemble", "one_model", "real", "trpo_mean", "no_early"] = "ensemble"
-    """Who says whether the policy improved on the last accepted one: each model votes (ensemble), the first model, the
-    real environment (an oracle; its steps are not counted), the updates' rollouts, or nobody: go on to max_updates."""
+    """What decides whether the policy improved on the last accepted one: a vote of the models (ensemble), the first
+    model, the real environment (an oracle; its steps are not counted), the updates' rollouts (trpo_mean), or nothing:
+    continue to max_updates (no_early)."""
     every: int = 5
     """Policy updates between two validations."""
     threshold: float = 0.7
-    """Accept while at least this share of the models improves."""
+    """Accept while the policy improves in at least this fraction of the models."""
     patience: int = 25
-    """Stop when this many updates have passed since the last accepted policy."""
+    """Stop after this many updates without an accepted policy."""
     max_updates: int = 400
-    """Most policy updates in one outer iteration."""
+    """Maximum number of policy updates in one outer iteration."""
     starts: int = 500
-    """Fixed start states from which every model evaluates the policy, deterministic, over the full horizon."""
+    """Number of fixed start states from which every model evaluates the deterministic policy over the full horizon."""
     real_episodes: int = 0
-    """Real episodes of an iteration that try its new policy, without noise; one that earns clearly less than the best
-    is given up. 0, or so many that they take more than a quarter of `collect.steps`: none."""
+    """Real episodes that try an iteration's new policy, without noise. A policy that earns clearly less than the best
+    is rejected. 0: none; nor where they would take more than a quarter of `collect.steps`."""
 
     def __post_init__(self) -> None:
         for name in ("every", "patience", "max_updates", "starts"):
@@ -334,7 +337,7 @@ System = Literal[
 """Names of the systems that the paper compares."""
 
 Method = Literal["model-based", "trpo", "ppo", "ddpg", "svg"]
-"""The loops: in the ensemble, or a baseline in the real environment."""
+"""The training loops: model-based, or a baseline in the real environment."""
 
 ImproverName = Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic"]
 """The rows of `metrpo.policy.improvers.improver_table.IMPROVERS`."""
@@ -345,49 +348,50 @@ Preset = Literal["fast", "paper", "long-horizon"]
 
 @dataclass(frozen=True)
 class Config:
-    """One run, whole: what `config.json` in a run directory holds."""
+    """All settings of one run, as `config.json` in a run directory holds them."""
 
     task: str
     """Name of a registered task (see `metrpo tasks`)."""
     env_kwargs: tuple[str, ...] = ()
-    """Keyword arguments that the task's environment is made with, each KEY=VALUE; in Python a dict will do, too."""
+    """Keyword arguments of the task's environment, each KEY=VALUE; in Python, a dict works too."""
     imports: tuple[str, ...] = ()
-    """Modules that are imported before the task is looked up: those that register its environment."""
+    """Modules to import before the task is looked up, because they register its environment."""
     preset: Preset = "fast"
-    """The preset that the values came from; a label, the values themselves count."""
+    """The preset that the values came from. Only a label: the values count."""
     seed: int = 0
-    """All randomness derives from it."""
+    """Seed of all randomness."""
     iterations: int = 10
-    """Outer iterations; may be raised later to go on with a finished run."""
+    """Outer iterations. Raise it later to continue a finished run."""
     real_steps: int | None = None
-    """Instead of `iterations`: go on until this many real steps have been collected. 0: collect none, learn from `data`
-    alone for `iterations`."""
+    """Instead of `iterations`: train until this many real steps are collected. 0: collect none, learn from `data` alone
+    for `iterations`."""
     data: str | None = None
-    """An .npz of logged transitions to start from (see `metrpo.world.offline_data`)."""
+    """Offline data to start from, an .npz of transitions (see `metrpo.world.offline_data`)."""
     system: System = "me-trpo"
-    """Which of the paper's systems the values describe (see `metrpo.systems`); a label, the values themselves count."""
+    """The paper's system that the values describe (see `metrpo.systems`). Only a label: the values count."""
     method: Method = "model-based"
-    """The loop: in the ensemble (the paper's Algorithms 1 and 2), or a baseline in the real environment: TRPO,
+    """The training loop: model-based (the paper's Algorithms 1 and 2), or a baseline in the real environment: TRPO,
     Stable-Baselines3's PPO and DDPG, stochastic value gradients."""
     improver: ImproverName = "trpo"
-    """How the policy is improved on imagined steps: by the score function (trpo, ppo, vpg) or by backpropagation
-    through the models, of the mean action or of reparametrised samples. This ppo is ours; the system ppo is another."""
+    """How to improve the policy on imagined steps: by the score function (trpo, ppo, vpg), or by backpropagation
+    through the models with the mean action (bptt) or reparametrised samples (bptt-stochastic). This ppo is ours; the
+    system ppo is Stable-Baselines3's."""
     learn_reward: bool = False
     """Learn the reward and the end of episodes even where the task has formulas for them."""
     trust_reward: bool = False
-    """Do not first hold the formulas of a task of your own against 1,000 (uncounted) real steps."""
+    """Skip the check of your own task's formulas against 1,000 real steps (not counted)."""
     max_action: float = 1.0
-    """Actions stay within plus and minus this, in the policy's units: 1 is the end of the environment's range."""
+    """Limit on the size of actions, in the policy's units: 1 is the end of the environment's range."""
     max_change: float | None = None
-    """Most that an action changes from one step to the next, in the same units; from the middle of the range at the
-    start of an episode. Whoever plays the policy's file is held to both. None: any."""
+    """Limit on the change of an action from one step to the next, in the same units; an episode starts from the middle
+    of the range. The exported policy keeps both limits. None: no limit."""
     history: int = 1
-    """Observations that policy and models see at each step: the newest, the older ones, and the actions between them.
-    1: the newest alone. 3, say, makes an action delay of two steps, and velocities that no sensor shows, learnable."""
+    """Number of observations that the policy and the models see at each step, with the actions between them. 1: only
+    the newest. 3, for example, makes a delay of two steps learnable, and velocities that no sensor measures."""
     evaluation_episodes: int = 20
-    """Real episodes of the deterministic policy that `return_real` averages; a report, never used to learn."""
+    """Real episodes of the deterministic policy that `return_real` averages. They are never learned from."""
     deterministic: bool = False
-    """One thread, same bytes every time; clock readings are left out of metrics.csv. Slower."""
+    """Use one thread and leave clock readings out of metrics.csv: the same bytes every time, but slower."""
     collect: CollectConfig = field(default_factory=CollectConfig)
     ensemble: EnsembleConfig = field(default_factory=EnsembleConfig)
     fit: FitConfig = field(default_factory=FitConfig)
@@ -420,4 +424,4 @@ def _is_module(name: str) -> bool:
 
 
 BUDGET_FIELDS = ("iterations", "real_steps")
-"""Fields that say how long to run, not what is run: they may change when a run is resumed."""
+"""Fields that say how long to run: they may change when a run is resumed."""

@@ -1,4 +1,4 @@
-"""A config as JSON text, as dotted settings, and out of both again."""
+"""A config to and from JSON, and as a flat dictionary of dotted settings."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ ADDED = (
     "config.learn_reward",
     "config.trust_reward",
 )
-"""Settings newer than the first config.json files: where one is missing, its default is what was done then."""
+"""Settings newer than the first config.json files: where one is missing, the run used its default."""
 
 
 def to_json(config: Config) -> str:
@@ -57,7 +57,7 @@ def to_json(config: Config) -> str:
 def from_json(text: str) -> Config:
     """The config that `to_json` wrote.
 
-    Raises `ConfigError` when the text is no JSON, a setting is missing, unknown, twice there, of the wrong type or
+    Raises `ConfigError` when the text is no JSON, or a setting is missing, unknown, repeated, of the wrong type or
     impossible.
     """
     return _build(Config, json_of(text, "config", ConfigError), "config")
@@ -102,9 +102,9 @@ def _build(cls: type, data: object, where: str) -> Any:
 
 
 def convert(kind: Any, value: Any, where: str) -> Any:
-    """`value` as a setting of type `kind` takes it: whole numbers for fractions, lists for tuples.
+    """`value` converted to a setting's type `kind`: a whole number to a float, a list to a tuple.
 
-    Raises `ConfigError`, beginning with `where`, when it is of another type or none of the choices.
+    Raises `ConfigError`, which begins with `where`, for another type and for none of the choices.
     """
     if dataclasses.is_dataclass(kind):
         return value if isinstance(value, typing.cast(type, kind)) else _build(typing.cast(type, kind), value, where)

@@ -1,4 +1,4 @@
-"""What surrounds a chart: its title, what it shows in a line, and the names of its colours."""
+"""The frame of a chart: its title, a note and the names of its colours."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from html import escape
 
 
 def figure(title: str, note: str, drawn: str, legend: Sequence[tuple[str, str]] = (), below: str = "") -> str:
-    """A chart with its title, what it is (`note`) above it, names of colours (style, name) and how to read it below."""
-    said = f" <small>{escape(note)}</small>" if note else ""
-    read = f'<p class="small">{escape(below)}</p>' if below else ""
-    return f"<figure><figcaption><b>{escape(title)}</b>{said}</figcaption>{drawn}{swatches(legend)}{read}</figure>"
+    """A chart with its title and `note` above it, and its legend (style, name) and reading aid (`below`) below it."""
+    small = f" <small>{escape(note)}</small>" if note else ""
+    aid = f'<p class="small">{escape(below)}</p>' if below else ""
+    return f"<figure><figcaption><b>{escape(title)}</b>{small}</figcaption>{drawn}{swatches(legend)}{aid}</figure>"
 
 
-def swatches(given: Sequence[tuple[str, str]]) -> str:
-    """The legend of some (style, name); nothing for none."""
-    if not given:
+def swatches(colours: Sequence[tuple[str, str]]) -> str:
+    """The legend of colours (style, name); empty for none."""
+    if not colours:
         return ""
-    items = "".join(f'<li><i class="swatch {style}"></i>{escape(name)}</li>' for style, name in given)
+    items = "".join(f'<li><i class="swatch {style}"></i>{escape(name)}</li>' for style, name in colours)
     return f'<ul class="legend">{items}</ul>'

@@ -16,9 +16,9 @@ import numpy as np
 COLOURS = 6
 _LEFT, _RIGHT, _TOP, _BOTTOM = 46, 10, 10, 34
 _APART = 80
-"""Between two values that are written beside arrows, at least."""
+"""Least distance between two values written beside arrows."""
 _FAR = 1e-6, 1e9
-"""Ends of every logarithmic axis of y; what lies beyond is an arrow."""
+"""Ends of a logarithmic y axis; points beyond are arrows."""
 
 
 @dataclass(frozen=True)
@@ -38,20 +38,20 @@ class Line:
 
 @dataclass(frozen=True)
 class Axes:
-    """How the axes of a line chart run."""
+    """The axes of a line chart."""
 
     frame: tuple[float, float] | None = None
-    """Limits of y; points beyond them are drawn as arrows at the edge."""
+    """Limits of y; points beyond them are arrows at the edge."""
     say_beyond: bool = True
-    """Their values stand beside such points."""
+    """Write the values of such points beside them."""
     zero: bool = False
-    """y has it, and the line y = 0 is drawn."""
+    """Include y = 0, and draw its line."""
     mark: float | None = None
-    """The line y = mark is drawn."""
+    """Draw the line y = mark."""
     log: bool = False
-    """x is logarithmic, and above zero."""
+    """Logarithmic x, above zero."""
     log_y: bool = False
-    """So is y, without a frame; what is not above zero is a gap."""
+    """Logarithmic y, without a frame; points not above zero are gaps."""
 
 
 def chart(
@@ -113,14 +113,14 @@ def bars(title: str, names: Sequence[str], columns: np.ndarray, x: Sequence[int]
 
 
 def real_frame(real: np.ndarray, others: np.ndarray) -> tuple[float, float] | None:
-    """Limits for real returns beside imagined ones: early models may promise a hundredfold, which must not flatten the
-    real curve."""
+    """Limits for real returns beside imagined ones: early models may promise a hundred times the return, which must not
+    flatten the real curve."""
     real, others = real[np.isfinite(real)], others[np.isfinite(others)]
     if not len(real) or not len(others):
         return None
     low, high = float(real.min()), float(real.max())
     span = max(high - low, 0.1 * abs(high), 1e-9)
-    # A promise that lasts is what there is to see.
+    # But show a promise that lasts.
     lasting = min(float(np.quantile(others, 0.75, method="lower")), high + 6 * span)
     most = max(high + 1.5 * span, lasting)
     return max(min(low, float(others.min())), low - span), min(max(high, float(others.max())), most)
@@ -195,14 +195,14 @@ def _band(line: Line, place: _Place) -> str:
 
 
 def _line(line: Line, place: _Place, say_beyond: bool) -> str:
-    parts, piece, told = [], list[str](), -math.inf
+    parts, piece, last_said = [], list[str](), -math.inf
     for x, y in zip(line.x, line.y, strict=True):
         if np.isfinite(x) and np.isfinite(y):
             piece.append(place.point(x, y))
-            # The values of neighbours beyond the frame would lie on each other.
+            # The values of neighbours beyond the frame would overlap.
             beyond = not place.ys[0] <= y <= place.ys[1]
-            say = bool(say_beyond and beyond and place.x(x) - told > _APART)
-            told = place.x(x) if say else told
+            say = bool(say_beyond and beyond and place.x(x) - last_said > _APART)
+            last_said = place.x(x) if say else last_said
             parts.append(_dot(line, place, x, y, say))
         elif piece:
             parts.append(_path(line, piece))
@@ -230,7 +230,7 @@ def _dot(line: Line, place: _Place, x: float, y: float, say_beyond: bool) -> str
 
 
 def _span(values: Sequence[np.ndarray], floor: float | None = None) -> tuple[float, float]:
-    """Least and largest finite value, apart at least a little; from `floor` on where it is given."""
+    """Least (or `floor`, if given) and largest finite value, with at least a small distance."""
     finite = np.concatenate([*(v[np.isfinite(v)] for v in values), []])
     if not len(finite):
         return 0.0, 1.0
@@ -242,7 +242,7 @@ def _span(values: Sequence[np.ndarray], floor: float | None = None) -> tuple[flo
 
 
 def _ticks(low: float, high: float, count: int) -> list[tuple[float, str]]:
-    """About `count` round numbers within the limits, each with its text, all in one unit."""
+    """About `count` round numbers within the limits, each with its text, in one unit."""
     rough = (high - low) / count
     unit = 10.0 ** math.floor(math.log10(rough))
     step = next(unit * m for m in (1, 2, 2.5, 5, 10) if unit * m >= 0.99 * rough)
@@ -251,7 +251,7 @@ def _ticks(low: float, high: float, count: int) -> list[tuple[float, str]]:
 
 
 def _decades(low: float, high: float) -> list[tuple[float, str]]:
-    """Round numbers on a logarithmic axis, 1 among them where it lies within."""
+    """Round numbers on a logarithmic axis, 1 included where it lies within."""
     parts = (1, 2, 5) if high / low < 100 else (1,)
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     every = math.ceil((last - first) / 8)

@@ -1,4 +1,4 @@
-"""The report's first table: each group of seeds with its mean, beside what no skill earns."""
+"""The report's first table: each group of seeds with its mean return, beside the returns without skill."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from metrpo.run.find import SeenRun
 
 
 def compared(runs: Sequence[SeenRun]) -> list[Compared]:
-    """The groups of several runs, as `metrpo compare` has them; none of a single run, or where no run has a return."""
+    """The groups of several runs, as `metrpo compare` has them; none for a single run, or where no run has a return."""
     return compare(runs) if len(runs) > 1 and any(map(has_returns, runs)) else []
 
 
 def group_section(groups: Sequence[Compared], colours: Mapping[tuple[str, str], str]) -> str:
-    """The section as HTML; `colours` are the groups' styles, by task and label. Nothing for no group."""
+    """The section as HTML; `colours` are the groups' styles, by task and label. Empty for no group."""
     if not groups:
         return ""
     several = len({one.task for one in groups}) > 1

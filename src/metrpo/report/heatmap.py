@@ -11,13 +11,13 @@ WIDTH = 380
 _LEFT, _TOP, _BOTTOM = 62, 34, 6
 _ROW = 16
 _NUMBER = 27
-"""Least width of a cell that holds its number."""
+"""Least width of a cell that shows its number."""
 _LABEL = 24
 """Least room for the name of a column."""
 
 
 def heat(
-    said: str,
+    summary: str,
     rows: Sequence[str],
     columns: Sequence[str],
     values: np.ndarray,
@@ -25,10 +25,10 @@ def heat(
     shade: Callable[[float], tuple[str, float]],
     text: Callable[[float], str],
 ) -> str:
-    """`values` [rows, columns] as cells of a colour (`shade`: CSS class and opacity) with their numbers (`text`) where
-    there is room; `heading` is what the columns are, `said` the whole in words for those who cannot see it.
+    """`values` [rows, columns] as coloured cells (`shade`: CSS class and opacity), with their numbers (`text`) where
+    there is room. `heading` names the columns; `summary` says it all in words, for readers who cannot see it.
 
-    What is not finite is an empty cell.
+    Cells that are not finite stay empty.
     """
     wide = (WIDTH - _LEFT) / max(len(columns), 1)
     numbers, every = wide >= _NUMBER, int(np.ceil(_LABEL / wide))
@@ -52,6 +52,5 @@ def heat(
             if numbers:
                 parts.append(f'<text class="mid in" x="{x + wide / 2:.1f}" y="{y + 12}">{text(float(value))}</text>')
     height = _TOP + len(rows) * _ROW + _BOTTOM
-    return (
-        f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(said, quote=True)}">{"".join(parts)}</svg>'
-    )
+    label = escape(summary, quote=True)
+    return f'<svg viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{label}">{"".join(parts)}</svg>'

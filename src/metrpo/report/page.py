@@ -1,4 +1,4 @@
-"""The report: one HTML page about some runs that needs no network, no script and no other file."""
+"""The report: one HTML page about runs, without network, scripts or other files."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from metrpo.report.tables import html_table
 from metrpo.run.find import FoundRuns, Group, SeenRun, group, is_finished, settings
 
 VIDEO_BYTES = 3_000_000
-"""Most bytes of videos inside of a page, all together; those beyond are links. In base64 they take a third more."""
+"""Most bytes of all videos inside a page; the others are links. In base64 they take a third more."""
 
 
 @np.errstate(all="ignore")  # 1e300 in a file is no reason to complain
 def page(found: FoundRuns, folder: Path) -> str:
-    """The report of some runs as HTML; `folder` is where it will lie, for links to videos.
+    """The report of runs as HTML; `folder` is where the page will lie, for links to videos.
 
-    Runs without a finished iteration are named beside those that could not be read.
+    Runs without a finished iteration are listed with those that could not be read.
     """
     runs = [run for run in found.runs if run.rows]
     groups = group(runs)
@@ -47,7 +47,7 @@ def page(found: FoundRuns, folder: Path) -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        # A browser that reads this page asks nobody for anything.
+        # A browser that opens this page makes no requests.
         "<meta http-equiv=\"Content-Security-Policy\" content=\"default-src 'none'; style-src 'unsafe-inline'; "
         'img-src data:; media-src data:"><meta name="color-scheme" content="light dark">'
         f"<title>{escape(', '.join(tasks) or 'metrpo')}: metrpo report</title><style>{STYLE}</style></head>"
@@ -56,8 +56,8 @@ def page(found: FoundRuns, folder: Path) -> str:
 
 
 def record(found: FoundRuns) -> dict[str, Any]:
-    """What the report says, for scripts: the groups, the runs with their numbers and warnings, what was skipped, and
-    how the groups differ. NaN is None."""
+    """The report for scripts: the groups, the runs with their metrics and warnings, what was skipped, and the settings
+    that differ. NaN is None."""
     runs = [run for run in found.runs if run.rows]
     groups = group(runs)
     return {
@@ -82,7 +82,7 @@ def record(found: FoundRuns) -> dict[str, Any]:
 
 
 def _seen(groups: list[Group]) -> list[Seen]:
-    found = []
+    seen = []
     for g in groups:
         place = [other for other in groups if other.task == g.task].index(g)
         names = [f"{g.label}, seed {run.config.seed}" for run in g.runs]
@@ -90,15 +90,15 @@ def _seen(groups: list[Group]) -> list[Seen]:
             full = f"{name} ({run.path.name})" if names.count(name) > 1 else name
             dashed = " dashed" * (place // charts.COLOURS % 2)
             colour = f"c{place % charts.COLOURS}{dashed}"
-            found.append(Seen(run, g, full, colour, examine(run.rows, run.config, run.yardsticks)))
-    return found
+            seen.append(Seen(run, g, full, colour, examine(run.rows, run.config, run.yardsticks)))
+    return seen
 
 
 def _summary(seen: list[Seen]) -> str:
     steps = sum(int(s.run.rows[-1]["real_steps"] or 0) for s in seen)
     unfinished = sum(not is_finished(s.run) for s in seen)
     open_ = f"; {unfinished} not finished" if unfinished else ""
-    return f"{counted(len(seen), 'run')}, {counted(steps, 'real step')} together{open_}."
+    return f"{counted(len(seen), 'run')}, {counted(steps, 'real step')} in all{open_}."
 
 
 def _health(seen: list[Seen], found: FoundRuns) -> str:
@@ -124,7 +124,7 @@ def _card(s: Seen, with_task: bool) -> str:
     items = "".join(
         f'<li class="{c.level}"><strong>{escape(c.measured)}</strong> since iteration {c.since}. '
         f'<span class="meaning">{escape(_sentence(c.meaning))}</span> '
-        f'<span class="help">What helps: {escape(c.help)}.</span></li>'
+        f'<span class="help">What to do: {escape(c.help)}.</span></li>'
         for c in s.concerns
     )
     task = f"{escape(s.group.task)}, " if with_task else ""
@@ -154,15 +154,15 @@ def _table(seen: list[Seen]) -> str:
         )
     return (
         f'<section id="runs"><h2>Runs</h2><div class="scroll">{html_table(heads, rows)}</div>'
-        "<p class=small>Returns are real, of the deterministic policy, "
-        "± their standard deviation over episodes; the gap is imagined minus real return.</p></section>"
+        "<p class=small>Real returns of the deterministic policy, "
+        "± their standard deviation over episodes. Gap: imagined minus real return.</p></section>"
     )
 
 
 def _differences(groups: list[Group]) -> str:
     different = _different(groups)
     if len(groups) < 2 or not different:
-        text = "All runs have the same settings, the seed aside." if len(groups) == 1 else ""
+        text = "All runs have the same settings, apart from the seed." if len(groups) == 1 else ""
         return f"<section><h2>Settings</h2><p>{text}</p></section>" if text else ""
     tasks = len({g.task for g in groups}) > 1
     heads = [f"{g.task}, {g.label}" if tasks else g.label for g in groups]

@@ -1,4 +1,4 @@
-"""The report's section about one task: learning curves, then every run's diagnostics and video."""
+"""The report's section on one task: learning curves, then every run's diagnostics and video."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ from metrpo.run.metrics import is_clock
 
 _QUANTITIES = (
     ("gap", "Gap", "imagined minus real return; near zero is good", True),
-    ("fraction_improved", "Models improved", "share of the models that a block of updates improved", True),
+    ("fraction_improved", "Models improved", "share of the models in which the policy improved", True),
     ("updates", "Policy updates", "tried in each iteration", True),
     ("accepted_updates", "Accepted updates", "of those tried, kept by validation", True),
-    ("rejected_steps", "Rejected updates", "of those tried, moved nothing", True),
+    ("rejected_steps", "Rejected updates", "of those tried, did not move the policy", True),
     ("kl", "KL divergence", "mean over the updates", True),
     ("mean_std", "Standard deviation", "of the policy's actions", True),
     ("saturated", "Saturated actions", "share of the policy's mean actions beyond the limits", True),
-    ("diverged", "Diverged rollouts", "share of the imagined ones", True),
+    ("diverged", "Diverged rollouts", "share of imagined rollouts", True),
     ("error_1", "Model error, one step", "on held-out real steps; 1: no better than predicting no change", False),
     ("error_T", "Model error, an episode", "the same after a whole imagined episode", False),
     ("disagreement_imagined", "Disagreement", "of the models in imagination, in standard deviations", False),
     ("outside", "Outside the data", "share of the imagined states beyond the real ones' range", True),
-    ("members_reset", "Models started anew", "in each iteration, having diverged", True),
+    ("members_reset", "Models started anew", "in each iteration, after they diverged", True),
     ("failed_episodes", "Episodes left out", "in which the environment failed", True),
     ("return_collected", "Collected return", "of the real episodes, with exploration noise", False),
     ("train_loss", "Training loss", "mean over the models", True),
-    ("fit_passes", "Passes of fitting", "over the training set", True),
+    ("fit_passes", "Epochs of fitting", "over the training set", True),
 )
-"""Column, title, what it is, and whether its axis has the zero."""
+"""Column, title, note, and whether the axis includes zero."""
 _OWN = (
     "iteration",
     "real_steps",
@@ -51,14 +51,14 @@ _OWN = (
     "validations",
     "disagreement_real",
 )
-"""Columns that are shown elsewhere."""
+"""Columns shown elsewhere."""
 _TRUST = (*RATIOS, "outside")
-"""Columns that begin so are drawn by `trust_of` for each run."""
+"""`trust_of` draws the columns that begin so, for each run."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """A run with what the page says about it."""
+    """A run with its name, colour and findings on the page."""
 
     run: SeenRun
     group: Group
@@ -68,7 +68,7 @@ class Seen:
 
 
 class Budget:
-    """Bytes that are left for videos."""
+    """Bytes left for videos."""
 
     def __init__(self, left: int) -> None:
         self.left = left
@@ -86,7 +86,7 @@ def task_section(task: str, seen: list[Seen], groups: list[Group], folder: Path,
         parts.append(f"<h3>Real and imagined return</h3>{inside if len(seen) <= 12 else folded}")
     several = len(groups) > 1
     still = [title for name, title, *_ in _QUANTITIES if _is_zero(seen, name)]
-    # What is shown of every run by itself is drawn once more to compare several.
+    # Quantities that each run shows by itself are drawn together as well, to compare several runs.
     drawn = [q for q in _QUANTITIES if q[1] not in still and (len(seen) > 1 or not q[0].startswith(_TRUST))]
     small = [_across(seen, *q, x, x_label) for q in drawn]
     others = [_across(seen, name, name, "", False, x, x_label) for name in _others(seen)]
@@ -142,7 +142,7 @@ def _ends(lines: list[Line]) -> np.ndarray:
 
 
 def _across(seen: list[Seen], name: str, title: str, note: str, zero: bool, x: str, x_label: str) -> str:
-    """One quantity of all runs of a task; nothing where none has it."""
+    """One quantity of all runs of a task; empty where none has it."""
     lines = [Line(s.run.column(x), s.run.column(name), s.name, s.colour, dots=len(seen) <= 4) for s in seen]
     lines = [line for line in lines if np.isfinite(line.y).any()]
     if not lines:
@@ -168,7 +168,7 @@ def _trust(s: Seen, x: str, x_label: str) -> str:
     axes = Axes(frame=charts.real_frame(real, imagined))
     drawn = chart(f"Real and imagined return of {s.name}", lines, x_label, "", axes=axes)
     horizon = s.run.config.imagine.horizon
-    return figure(s.name, f"imagined: {horizon} steps only, not to be compared" if horizon else "", drawn)
+    return figure(s.name, f"imagined: only {horizon} steps, not comparable" if horizon else "", drawn)
 
 
 def _of_run(s: Seen, x: str, x_label: str) -> str:
@@ -186,11 +186,11 @@ def _of_run(s: Seen, x: str, x_label: str) -> str:
         parts.append(figure("Validation loss", "of each model, on held-out real steps", drawn, legend))
     if np.isfinite(run.column("updates")).any():
         tried, kept, rejected = (run.column(n) for n in ("updates", "accepted_updates", "rejected_steps"))
-        given = (("tried", tried, "c2"), ("accepted", kept, "c0"), ("rejected", rejected, "c3"))
-        lines = [Line(at, y, name, style, dots=False) for name, y, style in given if np.isfinite(y).any()]
+        curves = (("tried", tried, "c2"), ("accepted", kept, "c0"), ("rejected", rejected, "c3"))
+        lines = [Line(at, y, name, style, dots=False) for name, y, style in curves if np.isfinite(y).any()]
         drawn = chart("Policy updates", lines, x_label, "", axes=Axes(zero=True))
         legend = [(line.style, line.name) for line in lines]
-        parts.append(figure("Policy updates", "tried, accepted by validation, rejected unmoved", drawn, legend))
+        parts.append(figure("Policy updates", "tried, accepted by validation, rejected without a move", drawn, legend))
     stages = [name for name in run.rows[0] if name.startswith("seconds_") and np.nansum(run.column(name)) > 0]
     if stages:
         names = [name.removeprefix("seconds_") for name in stages]
@@ -230,7 +230,7 @@ def _video(s: Seen, folder: Path, left: Budget) -> str:
 
 
 def _others(seen: list[Seen]) -> list[str]:
-    """Columns that no chart is made for: what later versions measure is shown too."""
+    """Columns without a chart of their own, such as those of later versions."""
     known = {*_OWN, *(q[0] for q in _QUANTITIES)}
     names = dict.fromkeys(name for s in seen for name in s.run.rows[0])
     shown = ("validation_loss_", *_TRUST)

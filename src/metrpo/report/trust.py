@@ -1,4 +1,4 @@
-"""The report's charts of how far a run's models can be trusted, from what `metrpo.model.diagnostics` measured."""
+"""The report's charts of how far to trust a run's models, from `metrpo.model.diagnostics`."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from metrpo.run.find import SeenRun
 from metrpo.run.metrics import column
 
 _STRONGEST = 0.6
-"""Opacity of a cell, at most: its number stays legible, on light and on dark."""
+"""Most opacity of a cell: its number stays legible on light and dark pages."""
 _DIMENSIONS, _CELLS = 30, 30
-"""Rows and columns of a heat map, at most."""
+"""Most rows and columns of a heat map."""
 _DOTTED = 12
-"""Iterations whose points are marked each."""
+"""Most iterations whose points are marked."""
 _NO_CHANGE = "above 1: worse than predicting no change"
 
 
 def trust_of(run: SeenRun, x: str, x_label: str) -> str:
-    """A run's figures on its models' errors, their agreement and where imagination goes; nothing where it has none."""
+    """A run's figures on its models' errors, their agreement and where imagination goes; empty where it has none."""
     charts = (_errors, _disagreement, _coverage)
     drawn = [chart_of(run, x, x_label) for chart_of in charts]
     return "".join([*drawn, _errors_by_dimension(run), _agreement(run)])
@@ -40,15 +40,15 @@ def _errors(run: SeenRun, x: str, x_label: str) -> str:
     ]
     drawn = chart("Model error by steps predicted", lines, x_label, "", axes=Axes(log_y=True, mark=1.0))
     legend = [(line.style, line.name) for line in lines]
-    note = "of predictions on held-out real episodes, over that of predicting no change"
+    note = "on held-out real episodes, divided by the error of predicting no change"
     return figure("Model error", note, drawn, legend, f"Median over the state's dimensions; {_NO_CHANGE}.")
 
 
 def _errors_by_dimension(run: SeenRun) -> str:
     last = run.details[-1] if run.details else {}
-    named = [found for name in last if (found := re.fullmatch(r"error_(\d+|T)_(\d+)", name))]
-    known = list(dict.fromkeys(found[1] for found in named))
-    dimensions = list(dict.fromkeys(int(found[2]) for found in named))
+    matches = [match for name in last if (match := re.fullmatch(r"error_(\d+|T)_(\d+)", name))]
+    known = list(dict.fromkeys(match[1] for match in matches))
+    dimensions = list(dict.fromkeys(int(match[2]) for match in matches))
     table = np.array([column([last], f"error_{k}_{d}")[0] for d in dimensions for k in known])
     if not np.isfinite(table).any():
         return ""
@@ -56,13 +56,13 @@ def _errors_by_dimension(run: SeenRun) -> str:
     finite = np.isfinite(values)
     sizes = np.where(finite, values, -np.inf)
     d, k = np.unravel_index(int(np.argmax(sizes)), sizes.shape)
-    said = (
+    summary = (
         f"Model error by state dimension and steps predicted: largest {number(values[d, k])}, of dimension "
         f"{dimensions[d]} after {after(known[k])}; {(values[finite] > 1).sum()} of {finite.sum()} above 1"
     )
     shown = np.sort(np.argsort(-sizes.max(axis=1), kind="stable")[:_DIMENSIONS])
     rows, columns = [f"s[{dimensions[i]}]" for i in shown], ["episode" if k == "T" else k for k in known]
-    drawn = heat(said, rows, columns, values[shown], "steps predicted", _of_error, _short)
+    drawn = heat(summary, rows, columns, values[shown], "steps predicted", _of_error, _short)
     few = f" The {len(shown)} worst of {len(dimensions)} dimensions." if len(shown) < len(dimensions) else ""
     note = f"of each state dimension, after iteration {last['iteration']}"
     return figure("Model error by dimension", note, drawn, (), f"Red, {_NO_CHANGE}.{few}")
@@ -70,14 +70,14 @@ def _errors_by_dimension(run: SeenRun) -> str:
 
 def _disagreement(run: SeenRun, x: str, x_label: str) -> str:
     if run.config.ensemble.members == 1:
-        return ""  # nobody to disagree with
-    given = (("disagreement_imagined", "imagined", "imagined"), ("disagreement_real", "real", "real thick"))
-    lines = [Line(run.column(x), y, name, style) for n, name, style in given if np.isfinite(y := run.column(n)).any()]
+        return ""  # no model to disagree with
+    curves = (("disagreement_imagined", "imagined", "imagined"), ("disagreement_real", "real", "real thick"))
+    lines = [Line(run.column(x), y, name, style) for n, name, style in curves if np.isfinite(y := run.column(n)).any()]
     if not lines:
         return ""
     drawn = chart("Disagreement of the models on real and imagined states", lines, x_label, "", axes=Axes(log_y=True))
     note = "spread of the models' predictions, in standard deviations of the data"
-    below = "Imagined far above real: the policy has gone where the models guess."
+    below = "Imagined far above real: the policy is where the models guess."
     return figure("Disagreement", note, drawn, [(line.style, line.name) for line in lines], below)
 
 
@@ -90,13 +90,13 @@ def _agreement(run: SeenRun) -> str:
     parts = np.array_split(np.arange(len(rows)), min(len(rows), _CELLS))
     values = np.array([[_mean(share[part]) for part in parts] for share in shares])
     names = [f"model {name.rsplit('_', 1)[1]}" for name in members]
-    told = ", ".join(f"{name} {_percent(_mean(share))}" for name, share in zip(names, shares, strict=True))
-    said = f"Share of the validations in which each model saw the policy improve, mean over the iterations: {told}"
+    means = ", ".join(f"{name} {_percent(_mean(share))}" for name, share in zip(names, shares, strict=True))
+    summary = f"Share of the validations in which each model saw the policy improve, mean over the iterations: {means}"
     heading = "iteration" if len(parts) == len(rows) else f"iterations, about {len(rows) / len(parts):.0f} to a cell"
     columns = [str(rows[part[0]]["iteration"]) for part in parts]
-    drawn = heat(said, names, columns, values, heading, lambda share: ("c2", _STRONGEST * share), _percent)
+    drawn = heat(summary, names, columns, values, heading, lambda share: ("c2", _STRONGEST * share), _percent)
     note = "% of the validations in which each model saw the policy improve"
-    return figure("Which models agree", note, drawn, (), "A pale row: a model that the others outvote.")
+    return figure("Which models agree", note, drawn, (), "A pale row is a model that the others outvote.")
 
 
 def _coverage(run: SeenRun, x: str, x_label: str) -> str:
@@ -106,11 +106,11 @@ def _coverage(run: SeenRun, x: str, x_label: str) -> str:
     line = Line(run.column(x), outside, "outside", "c3")
     drawn = chart("Imagined states outside the data", [line], x_label, "", axes=Axes(zero=True))
     note = "share of the imagined states beyond the range of the real ones in any dimension"
-    return figure("Outside the data", note, drawn, (), "There the models guess: no real step has been so far out.")
+    return figure("Outside the data", note, drawn, (), "There the models guess: no real step has been that far out.")
 
 
 def _of_error(value: float) -> tuple[str, float]:
-    """Blue up to no change, red above it, each the stronger the larger the error."""
+    """Blue for errors up to 1 (no change), red above; the larger the error, the stronger the colour."""
     return ("c0", _STRONGEST * 0.7 * value) if value <= 1 else ("c3", _STRONGEST * min(0.5 + np.log10(value) / 2, 1.0))
 
 
