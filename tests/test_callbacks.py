@@ -89,7 +89,7 @@ def test_a_callback_that_fails_is_warned_of_once_and_costs_nothing(name, tmp_pat
         training.train(CONFIG, tmp_path, SILENT, [broken, heard])
     assert broken.all.count(name) == 1, "called no more"
     assert [r.getMessage() for r in caplog.records] == [
-        "Broken is called no more (OSError: no network); training goes on"
+        "Broken failed and is not called again (OSError: no network); training continues"
     ]
     assert len(read_metrics(tmp_path / "metrics.csv")) == 5
     assert heard.all[-1] == ("end",)

@@ -96,7 +96,7 @@ def learn(
     clock: Clock | None = None,
     real: Real = NOTHING,
 ) -> tuple[State, Row]:
-    """The rest of an outer iteration: what `episodes`, and all before them, teach.
+    """The rest of an outer iteration: learns from `episodes` and all before them.
 
     What only records (diagnostics, evaluation) cannot fail: it is NaN then, with a warning.
 
@@ -116,12 +116,12 @@ def learn(
     with clock("improve"):
         progress.stage("improve", config.validate.max_updates)
         if state.iteration == 0 and (inputs := inputs_for(config, task, dataset)):
-            # A fresh policy's weights are meant for normalised states; by what, only the first data say.
+            # A fresh policy's weights expect normalised states; only the first data gives the scales.
             state = state._replace(policy=folded(state.policy, inputs))
         policy, baseline, improved = improve_policy(
             config, task, state._replace(dataset=dataset), ensemble, progress, clock
         )
-        advice = "the run was resumed from, or became, a state that cannot go on: use smaller steps or start anew"
+        advice = "training cannot continue from this state: use smaller steps or start anew"
         require_finite("improve", iteration, advice, policy=policy, baseline=baseline)
     candidate = State(
         iteration=iteration,
@@ -142,11 +142,11 @@ def learn(
 
 
 def _logged(config: Config, task: Task) -> Dataset:
-    """The dataset before the first iteration: what was logged elsewhere, or nothing."""
+    """The dataset before the first iteration: offline data, or nothing."""
     nothing = datasets.empty(task.state_size, task.action_size, task.predicted)
     if config.data is None:
         if config.real_steps == 0:
-            raise ConfigError("real_steps: expected at least 1 without logged transitions to learn from (data), got 0")
+            raise ConfigError("real_steps: expected at least 1 without offline data (data), got 0")
         return nothing
     rng = rng_of(config.seed, 0, Stage.SPLIT)
     return datasets.add(nothing, offline_data.load(config.data, task), config.collect, rng, task.learned, task.carried)

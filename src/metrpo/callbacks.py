@@ -1,4 +1,4 @@
-"""What a program may do as a run goes on: a callback hears of each row of metrics, real episode and checkpoint."""
+"""Callbacks: a program receives each row of metrics, real episode and checkpoint during training."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ IterationRow = Mapping[str, int | float | None]
 
 
 class Callback(Protocol):
-    """Subclass it and override what you want to hear of; what you leave out does nothing.
+    """Subclass it and override the methods that you need; the others do nothing.
 
-    What a callback raises costs a warning, and that callback is called no more: it may not cost what is learned.
+    An exception in a callback gives a warning, and that callback is not called again: training must not fail by it.
     """
 
     def on_begin(self, config: Config, run_dir: Path | None, rows: Sequence[IterationRow]) -> None:
-        """Training begins, or goes on after the iterations in `rows`."""
+        """Training begins, or resumes after the iterations in `rows`."""
 
     def on_episode(self, episode: Episode) -> None:
         """One more real episode has been played, exploring or as a proof (only where the method learns models).
@@ -34,14 +34,14 @@ class Callback(Protocol):
         """An outer iteration is finished, with this row of `metrics.csv`."""
 
     def on_checkpoint(self, checkpoint: Path) -> None:
-        """It is saved in this file; only with a run directory."""
+        """The iteration is saved in this file; only with a run directory."""
 
     def on_end(self) -> None:
         """Training has ended, finished or not."""
 
 
 class Callbacks(Callback):
-    """Several callbacks, of which one that fails is warned of once and called no more."""
+    """Several callbacks; one that fails gives one warning and is not called again."""
 
     def __init__(self, callbacks: Sequence[Callback]) -> None:
         self._callbacks = list(callbacks)
@@ -77,11 +77,11 @@ class Callbacks(Callback):
             except Exception as error:  # whatever somebody's code raises
                 self._callbacks.remove(one)
                 why = f"{type(error).__name__}: {error}"
-                _log.warning("%s is called no more (%s); training goes on", type(one).__name__, why)
+                _log.warning("%s failed and is not called again (%s); training continues", type(one).__name__, why)
 
 
 class _Telling:
-    """A log of episodes that tells of each one that is added."""
+    """A log of episodes that passes each new one to the callbacks."""
 
     def __init__(self, log: Log, callbacks: Callbacks) -> None:
         self._log, self._callbacks = log, callbacks
@@ -89,7 +89,7 @@ class _Telling:
         self.failures, self.note_failures = log.failures, log.note_failures
 
     def append(self, episode: Episode, proof: bool = False) -> object:
-        """Keeps it, and tells of it."""
+        """Keeps it, and passes it on."""
         kept = self._log.append(episode, proof)
         self._callbacks.on_episode(episode)
         return kept

@@ -1,4 +1,4 @@
-"""A finished policy in the real environment: what it earns, and how it looks."""
+"""A finished policy in the real environment: its return, and its video."""
 
 from __future__ import annotations
 
@@ -63,10 +63,10 @@ def evaluate(
     episodes: int = 20,
     seed: int = 0,
 ) -> EvaluationResult:
-    """Plays whole real episodes with a policy: a run directory, what `load_policy` gives, or any function [S] -> [A].
+    """Plays whole real episodes with a policy: a run directory, what `load_policy` returns, or any function [S] -> [A].
 
-    `task` is needed for a plain function, and where the file of a run's task has moved; another task of the same sizes
-    may be named too. The same seed gives the same start states.
+    `task` is needed for a plain function, and where the file of a run's task has moved; it may also name another task
+    of the same sizes. The same seed gives the same start states.
 
     Raises `RunDirectoryError` when the directory holds no sound policy, `TaskError` for an unknown task, `ConfigError`
     for fewer than one episode or a function without a task; `TaskError` also for a policy of another task's sizes.
@@ -77,7 +77,7 @@ def evaluate(
     act = _loaded(policy) if isinstance(policy, str | Path) else policy
     if task is not None or not isinstance(act, LoadedPolicy):
         if task is None:
-            raise ConfigError("task: expected the task that this function is to be evaluated on, got none")
+            raise ConfigError("task: expected a task to evaluate this function on, got none")
         known = _task_at(task, act.info if isinstance(act, LoadedPolicy) else None)
     else:
         made = act.info
@@ -110,23 +110,23 @@ def render(run_dir: str | Path, out: str | Path | None = None, seed: int = 0, ta
 
 
 def _loaded(place: str | Path) -> LoadedPolicy:
-    """The policy of a place; one from the hub without its author's imports, which nobody here has asked for."""
+    """The policy of a place; one from the hub without its author's imports, which nobody here asked for."""
     policy = load_policy(place)
     return replace(policy, info=replace(policy.info, imports=())) if is_on_hub(place) else policy
 
 
 def _task_of(place: str | Path, made: PolicyInfo) -> Task:
-    """The task of a place's policy. Raises `TaskError` where a policy from the hub would have code of that name run."""
+    """The task of a place's policy. Raises `TaskError` where a policy from the hub would run code by name."""
     if is_on_hub(place) and ":" in made.task:
         raise TaskError(
-            f"{place}: its author's task is {brief(made.task)}, and a name from elsewhere runs no code here; say "
-            "what to play: --task path/to/file.py:name or module:name"
+            f"{place}: its author's task is {brief(made.task)}, and a downloaded name runs no code here; name the task "
+            "yourself: --task path/to/file.py:name or module:name"
         )
     return task_of_run(located(place), made)
 
 
 def _task_at(task: str, made: PolicyInfo | None) -> Task:
-    """The task of that name: with the policy's own arguments where it may be the policy's task, moved."""
+    """The task of that name, with the policy's arguments where it may be the policy's own task, moved."""
     if made is None or (":" not in task and task != made.task):
         return get_task(task)
     return get_task(task, made.env_kwargs, made.imports)
@@ -143,5 +143,5 @@ def _require_fit(policy: LoadedPolicy, task: Task) -> None:
         raise TaskError(
             f"{task.name}: expected a policy of {counted(task.state_size, 'observed number')} and "
             f"{counted(task.action_size, 'action')}, got one of {has[0]} and {has[1]}, trained on "
-            f"{brief(policy.info.task)}; name that task, or train one for this"
+            f"{brief(policy.info.task)}; name that task, or train a policy for this one"
         )

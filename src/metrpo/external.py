@@ -1,11 +1,11 @@
-"""One outer iteration in separate steps, where another program plays the episodes: a robot's own, say.
+"""One outer iteration in separate steps, where another program plays the episodes, on a robot, say.
 
     begin(config, DIR)        writes the untrained policy
     repeat:
         DIR/policy.npz        plays; its episodes come back by `append_episode`, from a log, or by `collect`
-        improve(DIR)          learns from all that have come, and writes the next policy
+        improve(DIR)          learns from the new episodes, and writes the next policy
 
-Each step leaves the run directory as `train` does, which may go on with it, and the other way round.
+Each step leaves the run directory as `train` does: `train` may continue such a run, and these steps one of `train`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from metrpo.world.task import Task
 
 
 def begin(config: Config, run_dir: str | Path) -> None:
-    """Makes `run_dir` a run that has learned nothing yet; its policy can play at once.
+    """Creates a run in `run_dir` that has learned nothing yet; its policy can play at once.
 
     Raises `RunDirectoryError` when `run_dir` cannot be used or holds a run, `TaskError` and `ConfigError` as `train`.
     """
@@ -41,7 +41,9 @@ def begin(config: Config, run_dir: str | Path) -> None:
     state = _ours(config, known)
     with RunDirectory(run_dir, config, known.interface) as run:
         if run.load(state) is not None:
-            raise RunDirectoryError(f"{run_dir} holds a run already: go on with metrpo improve, or choose another")
+            raise RunDirectoryError(
+                f"{run_dir} holds a run already: continue it with metrpo improve, or choose another"
+            )
         check(config, known)
         task_file.remember(run_dir, config)
         run.begin(state)
@@ -54,11 +56,11 @@ def collect(
     progress: Progress = SILENT,
     task: str | None = None,
 ) -> list[Episode]:
-    """Adds real episodes to those that wait, and returns all that do.
+    """Adds real episodes to a run, and returns all that wait to be learned from.
 
     Plays the environment with exploration until the waiting episodes have `at_least` steps (default: the config's
-    `collect.steps`, within its budget of real steps), or reads offline data (`world.offline_data`) and adds what does
-    not wait yet. `task` says where the run's task is, if its file has moved.
+    `collect.steps`, within its budget of real steps), or adds offline data (`world.offline_data`) that does not wait
+    yet. `task` names the run's task, if its file has moved.
 
     Raises `RunDirectoryError` when `run_dir` holds no run, `TaskError` when the task has no environment to play,
     `ConfigError` when the budget is spent and `at_least` does not ask for more.
@@ -70,7 +72,7 @@ def collect(
         if data is not None:
             waiting = Counter(map(_content, run.episodes.pending()))
             for episode in offline_data.load(data, known):
-                if waiting[_content(episode)]:  # added already, when this was stopped half-way
+                if waiting[_content(episode)]:  # added already, before a stop half-way
                     waiting[_content(episode)] -= 1
                 else:
                     run.episodes.append(episode)
@@ -78,7 +80,7 @@ def collect(
         known.require_playable()
         if at_least is None and budget.steps_left(config, state.real_steps) == 0:
             raise ConfigError(
-                f"real_steps: the budget of {run_dir}, {config.real_steps:,}, is spent; to play more all the same: "
+                f"real_steps: the budget of {run_dir}, {config.real_steps:,}, is spent; to play more anyway: "
                 f"metrpo collect {run_dir} --steps {config.collect.steps}"
             )
         progress.begin(state.iteration + 1, None)
@@ -89,10 +91,10 @@ def collect(
 
 
 def improve(run_dir: str | Path, progress: Progress = SILENT, task: str | None = None) -> Row:
-    """Learns from the episodes that wait, one outer iteration, and returns its row of metrics.
+    """Learns from a run's new episodes in one outer iteration, and returns its row of metrics.
 
-    `task` says where the run's task is, if its file has moved. Raises `RunDirectoryError` when `run_dir` holds no run,
-    or no episodes wait.
+    `task` names the run's task, if its file has moved. Raises `RunDirectoryError` when `run_dir` holds no run or no new
+    episodes.
     """
     config = stored_config(run_dir)
     known = _settled(run_dir, config, task)
@@ -106,7 +108,7 @@ def improve(run_dir: str | Path, progress: Progress = SILENT, task: str | None =
             )
         progress.begin(state.iteration + 1, None)
         try:
-            real = Real(algorithm.left_out(run.episodes))  # none to prove the policy: who plays is another program
+            real = Real(algorithm.left_out(run.episodes))  # no proofs of the policy: another program plays
             written = run.save(*algorithm.learn(config, known, state, episodes, progress, None, real))
             progress.end(written, None)
         finally:
@@ -135,7 +137,7 @@ def _content(episode: Episode) -> tuple[bytes | bool, ...]:
 
 def _ours(config: Config, task: Task) -> State:
     if config.method != "model-based":
-        raise ConfigError(f"system: expected one that learns models, got {config.system}; it runs by metrpo train only")
+        raise ConfigError(f"system: expected one that learns models, got {config.system}; use metrpo train for it")
     require_memory(config, task)
     return algorithm.init(config, task)
 

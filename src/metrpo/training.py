@@ -1,8 +1,8 @@
-"""Training by any method: one outer iteration after the other until the budget is spent, saved and resumed.
+"""Training by any method: outer iterations until the budget is spent, saved and resumed.
 
-`algorithm` is the method that this project is for; `baselines` are what it is compared with. A method is a pair of
-functions, init(config, task) -> state and step(config, task, state, progress) -> (state, row of metrics). The task is
-looked up here, once, and passed on.
+`algorithm` is this project's method, `baselines` are the methods to compare it with. A method is a pair of functions,
+init(config, task) -> state and step(config, task, state, progress) -> (state, row of metrics). The task is looked up
+here, once, and passed on.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ METHODS = {
     "ppo": "metrpo.baselines.stable_baselines",
     "ddpg": "metrpo.baselines.stable_baselines",
 }
-"""Modules with `init` and `step`; imported when used, for some need libraries of their own."""
+"""Modules with `init` and `step`; imported when used, because some need extra libraries."""
 _LIMITED = ("model-based", "trpo")
-"""Methods whose real steps are all played by `world.collection` and learned from as they were executed."""
+"""Methods whose real steps `world.collection` plays, and that learn from actions as executed."""
 
 
 def init(config: Config) -> Saved:
@@ -63,10 +63,12 @@ def init(config: Config) -> Saved:
 
 def _init(config: Config, task: Task) -> Saved:
     if config.method != "model-based" and (config.data is not None or config.real_steps == 0):
-        raise ConfigError(f"data: only the method model-based learns from logged transitions, got {config.method}")
+        raise ConfigError(f"data: expected the method model-based to learn from offline data, got {config.method}")
     if config.method not in _LIMITED and Limits.of(config) != NONE:
         limit = "max_action" if config.max_action < 1 else "max_change"
-        raise ConfigError(f"{limit}: only {' and '.join(_LIMITED)} learn under limits, got the method {config.method}")
+        raise ConfigError(
+            f"{limit}: expected the method {' or '.join(_LIMITED)} to learn under limits, got {config.method}"
+        )
     require_memory(config, task)
     state: Saved = import_module(METHODS[config.method]).init(config, task)
     return state
@@ -75,7 +77,7 @@ def _init(config: Config, task: Task) -> Saved:
 def step(config: Config, state: Saved, progress: Progress = SILENT, log: Log | None = None) -> tuple[Saved, Row]:
     """One outer iteration of the config's method: the next state and its row of metrics.
 
-    Real episodes go to `log` as they end, where the method is ours: the baselines learn where steps cost nothing.
+    The model-based method writes real episodes to `log` as they end. (For the baselines, real steps are cheap.)
     """
     return _step(config, task_for(config), state, progress, log)
 
@@ -94,14 +96,15 @@ def train(
     progress: Progress | None = None,
     callbacks: Sequence[Callback] = (),
 ) -> Saved:
-    """Runs the loop until the budget is spent and returns the last state.
+    """Trains until the budget is spent and returns the last state.
 
-    With `run_dir`, every iteration is saved there; a run found there is resumed, exactly as if it had never stopped.
+    With `run_dir`, every iteration is saved there. A run that is there already resumes, exactly as if it had never
+    stopped.
 
-    `progress` is by default shown in a terminal and in a notebook, and not elsewhere; `metrpo.SILENT` shows nothing.
-    `callbacks` hear of rows, episodes and checkpoints (`metrpo.Callback`).
+    By default, `progress` is shown in a terminal and in a notebook only; `metrpo.SILENT` shows none. `callbacks`
+    receive rows, episodes and checkpoints (`metrpo.Callback`).
 
-    The formulas of a task of the user's own are checked first (`metrpo.world.formula_check`).
+    The formulas of a user's own task are checked first (`metrpo.world.formula_check`).
 
     Raises `TaskError` for an unknown or broken task and `RunDirectoryError` when `run_dir` cannot be used.
     """
@@ -135,7 +138,7 @@ def _train(config: Config, run_dir: str | Path | None, progress: Progress, callb
 
 
 def _say_where(config: Config, run: RunDirectory, state: Saved, measured: bool, progress: Progress) -> None:
-    """Says that a run is taken up, where one is: also one that has finished no iteration."""
+    """Says that a run resumes, even one without a finished iteration."""
     waiting = run.episodes.waiting_steps()
     if state.iteration or state.real_steps or waiting or measured:
         left = _iterations_left(config, state)
@@ -144,33 +147,33 @@ def _say_where(config: Config, run: RunDirectory, state: Saved, measured: bool, 
 
 
 def check(config: Config, task: Task) -> None:
-    """Holds the formulas of a task that is not ours against its environment (`metrpo.world.formula_check`).
+    """Checks the formulas of a user's task against its environment (`metrpo.world.formula_check`).
 
-    Says what evaluation will cut. Raises `TaskError` where they differ.
+    Warns of episodes that evaluation will cut. Raises `TaskError` where formulas and environment differ.
     """
     if task.playable and task.horizon > RECORDED:
         _log.warning(
-            "%s: episodes of up to %s steps: evaluation cuts them after %s, and there is no gap between imagined and "
-            "real returns",
+            "%s: episodes have up to %s steps; evaluation cuts them after %s, so the gap between imagined and real "
+            "returns is not measured",
             task.name, f"{task.horizon:,}", f"{RECORDED:,}",
         )  # fmt: skip
-    # Which the tests hold against their environments, as these are without arguments.
+    # The tests check ours against their environments (without arguments).
     ours = task.make is None or (task.name in KNOWN and not config.env_kwargs)
     if not (ours or config.trust_reward or config.learn_reward):
         check_formulas(task, rng_of(config.seed, 0, Stage.COLLECT))
 
 
 def _measure_yardsticks(config: Config, task: Task, run: RunDirectory, progress: Progress) -> None:
-    """Keeps in run.json, and says, what no skill earns: real steps that nobody counts and nothing is learned from."""
+    """Measures, prints and keeps in run.json what no skill earns. Its real steps are not counted or learned from."""
     if not task.playable or config.real_steps == 0:
         return
     try:
-        found = measure(task)
+        yardsticks = measure(task)
     except MetrpoError as error:  # a record may not cost the run
-        _log.warning("what doing nothing and random actions earn could not be measured: %s", error)
+        _log.warning("cannot measure the returns of doing nothing and of random actions: %s", error)
         return
-    keep(run.path, config.task, found.record())
-    progress.say(found.text())
+    keep(run.path, config.task, yardsticks.record())
+    progress.say(yardsticks.text())
 
 
 def _loop(
@@ -200,7 +203,7 @@ def _loop(
 
 
 def seconds_left(seconds: Sequence[float], iterations: int | None) -> float | None:
-    """About how long so many iterations take, by the last three: they grow with the data. The first one compiled."""
+    """About how long `iterations` take, by the last three: they grow with the data. The first one compiles."""
     if iterations == 0:
         return 0.0
     if iterations is None or len(seconds) < 2:

@@ -98,7 +98,7 @@ def test_a_policy_that_earns_less_than_nothing_does_is_told():
     found = {c.code: c for c in examine(healthy(), CONFIG, idle)}
     assert found["no-skill"].since == 1
     assert found["no-skill"].level == "warning"
-    assert "where doing nothing earns 120" in found["no-skill"].measured
+    assert "while doing nothing earns 120" in found["no-skill"].measured
     assert [c.level for c in examine(healthy(3), CONFIG, idle) if c.code == "no-skill"] == ["note"], "it has time"
     assert "no-skill" not in [
         c.code for c in examine(healthy(), CONFIG, {"doing nothing": 5.0, "random actions": -3.0})
@@ -125,7 +125,7 @@ def test_settings_count():
     assert "model-exploited" not in codes(exploiting(), bonus), "the imagined return holds the bonus"
     assert "few-evaluation-episodes" in codes(healthy(), dataclasses.replace(CONFIG, evaluation_episodes=1))
     helps = {c.code: c.help for c in examine(exploiting(), ONE_MODEL)}
-    assert helps["model-exploited"].startswith("five models instead of one (ensemble.members)")
+    assert helps["model-exploited"].startswith("try five models instead of one (ensemble.members)")
 
 
 def test_one_bad_fit_is_not_yet_blind():
@@ -154,7 +154,7 @@ def test_negative_returns_and_returns_through_zero():
     rows = [r | {"return_real": r["return_real"] - 300, "return_imagined": 0.0} for r in healthy()]
     rows = [r | {"gap": -r["return_real"]} for r in rows]
     found = {c.code: c for c in examine(rows, CONFIG)}
-    assert found["model-exploited"].measured.startswith("Imagined return 0 where -200 is real")
+    assert found["model-exploited"].measured.startswith("Imagined return 0, real return -200")
     # A small gap where the return happens to be near zero, of a run that has come a long way, is none.
     through = [r | {"return_real": 50.0 * i - 550, "gap": 40.0} for i, r in enumerate(healthy())]
     assert "model-exploited" not in codes(through)

@@ -283,7 +283,7 @@ def test_evaluate_prints_the_returns(capsys):
 
 
 def test_evaluating_a_function_needs_a_task():
-    with pytest.raises(metrpo.ConfigError, match="expected the task"):
+    with pytest.raises(metrpo.ConfigError, match="expected a task"):
         metrpo.evaluate(lambda state: np.zeros(2))
     assert metrpo.evaluate(lambda state: np.zeros(2), "swimmer", episodes=1).task == "Swimmer"
 

@@ -81,7 +81,7 @@ def test_formulas_are_held_against_an_environment_with_arguments():
 
 
 def test_arguments_that_cannot_be_used_are_refused():
-    with pytest.raises(TaskError, match=r"Pendulum-v1: cannot be made \(TypeError: .*gravity"):
+    with pytest.raises(TaskError, match=r"Pendulum-v1: cannot create the environment \(TypeError: .*gravity"):
         get_task("Pendulum-v1", {"gravity": 1})
-    with pytest.raises(TaskError, match="Swimmer: expected no env_kwargs, got g=5: its environment is made already"):
+    with pytest.raises(TaskError, match="Swimmer: expected no env_kwargs, got g=5: its environment exists already"):
         get_task("Swimmer", {"g": 5})

@@ -81,7 +81,7 @@ def test_a_table_of_runs(tmp_path):
     assert all("stopped" in line and line[-1] == "ago" for line in stopped)
     assert finished[4] == "3"
     assert finished[-1] == "finished"
-    assert f"cannot be read: {tmp_path}/bad/config.json" in text
+    assert f"skipped: {tmp_path}/bad/config.json" in text
     assert "\x1b" not in text, "no control codes where there is no terminal"
 
 

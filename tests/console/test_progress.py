@@ -50,8 +50,8 @@ def play(progress, pause=0.0):
     [
         (5, 20, "resuming runs/[a] at iteration 5 of 20, 12,000 real steps"),
         (5, None, "resuming runs/[a] at iteration 5, 12,000 real steps"),
-        (1, 20, "resuming runs/[a] at iteration 1 of 20, 12,000 real steps and 600 that wait"),
-        (5, 4, "runs/[a] is finished: 4 iterations, 12,000 real steps; a larger budget goes on"),
+        (1, 20, "resuming runs/[a] at iteration 1 of 20, 12,000 real steps and 600 new ones"),
+        (5, 4, "runs/[a] is finished: 4 iterations, 12,000 real steps; raise the budget to continue it"),
     ],
 )
 def test_a_resumed_run_says_so(iteration, of, said):

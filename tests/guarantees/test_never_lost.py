@@ -124,7 +124,7 @@ def test_no_record_costs_what_is_learned(monkeypatch, caplog):
     assert (sound["failed_evaluation"], row["failed_evaluation"]) == (0, 1)
     assert unknown == measured | {name for name in row if name.startswith(("error_", "end_"))} - {"end_recall"}
     told = [record.getMessage() for record in caplog.records]
-    assert told[0] == ("iteration 1 has no diagnostics (RuntimeError: no model of it); what it has learned is kept")
+    assert told[0] == ("iteration 1 has no diagnostics (RuntimeError: no model of it); what it learned is kept")
     assert told[1].startswith("Ending: close() raised RuntimeError: no model of it")
     assert told[2].startswith("iteration 1 has no return_real (evaluate, iteration 1: Ending: step 3 of an episode: ")
     assert told[3].startswith("iteration 1 has no calibration (RuntimeError")

@@ -315,7 +315,7 @@ def test_a_poisoned_member_is_made_anew_and_disturbs_no_other(clean, caplog, lea
     state = clean.states[0]._replace(networks=member_poisoned(clean.states[0].networks, 1, value, LEAVES[leaf]))
     ensemble, info = ensemble_fit.fit_ensemble(TINY, probe.PROBE, state.networks, clean.states[1].dataset, 2, SILENT)
     assert (info.resets, sound(ensemble), sound(info)) == (1, True, True)
-    assert "fit, iteration 2: members 1 diverged: re-initialised and fitted again" in caplog.text
+    assert "fit, iteration 2: members 1 diverged; re-initialised and fitted again" in caplog.text
     expected, expected_info = clean.fits[1]
     assert same(only(ensemble.networks, [0, 2]), only(expected.networks, [0, 2]))
     assert same(only(info[1:4], [0, 2]), only(expected_info[1:4], [0, 2]))
@@ -364,7 +364,7 @@ def test_a_member_that_diverges_later_keeps_its_best_weights(clean, monkeypatch,
     Blocks(monkeypatch, 0, value, lambda block: block == 2)
     ensemble, info = second_fit(clean)
     assert (info.resets, list(info.diverged), list(info.lost)) == (0, [True, False, False], [False] * 3)
-    assert "fit, iteration 2: members 0 diverged, and keep their best weights" in caplog.text
+    assert "fit, iteration 2: members 0 diverged and kept their best weights" in caplog.text
     assert info.best_pass[0] == TINY.fit.validate_every
     assert sound(ensemble)
     assert same(only(ensemble.networks, [1, 2]), only(clean.fits[1][0].networks, [1, 2]))

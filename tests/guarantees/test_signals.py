@@ -224,6 +224,6 @@ def test_a_process_ends_so(number, code, tmp_path):
         process.send_signal(number)
         _, err = process.communicate(timeout=350)
     assert process.returncode == code
-    assert "metrpo: stopping after this iteration; once more stops at once" in err
+    assert "metrpo: stopping after this iteration; press again to stop at once" in err
     assert "The same command resumes.\n\n  metrpo train Probe --run-dir" in err
     assert finished(tmp_path / "run") == [1]

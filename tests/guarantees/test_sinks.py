@@ -143,7 +143,7 @@ class Broken(Progress):
 def test_a_display_that_breaks_costs_only_itself(name, tmp_path, expected, caplog):
     train(CONFIG, tmp_path, TolerantProgress(Broken(name)))
     assert differing(result(tmp_path), expected) == []
-    message = "no progress from here on (RuntimeError: no fonts); training goes on"
+    message = "progress is not shown any more (RuntimeError: no fonts); training continues"
     assert [r.getMessage() for r in caplog.records] == [message]
 
 
@@ -161,7 +161,7 @@ def shell(run_dir, how):
     )
 
 
-WARNING = "metrpo: no progress from here on ({}); training goes on\n"
+WARNING = "metrpo: progress is not shown any more ({}); training continues\n"
 OUTPUTS = {
     "head": ("{} | head -1; exit ${{PIPESTATUS[0]}}", WARNING.format("BrokenPipeError: [Errno 32] Broken pipe")),
     "both": ("{} 2>&1 | head -1; exit ${{PIPESTATUS[0]}}", ""),

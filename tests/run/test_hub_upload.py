@@ -183,7 +183,7 @@ def test_a_policy_of_the_hub_runs_no_code_that_its_author_names(tmp_path, monkey
     monkeypatch.setattr("metrpo.policy_zoo.downloaded", lambda place: there)
     a_finished_run(there, dataclasses.replace(CONFIG, task="mine.py:task", imports=("imported",)))
     for use in (evaluate, render):
-        with pytest.raises(TaskError, match="a name from elsewhere runs no code here; say what to play: --task"):
+        with pytest.raises(TaskError, match="a downloaded name runs no code here; name the task yourself: --task"):
             use("hub:me/x")
     task = get_task("Swimmer")
     monkeypatch.setattr("metrpo.world.batch_episodes.evaluate", lambda known, *_: np.array([float(known.horizon)]))

@@ -107,7 +107,7 @@ def test_gymnasiums_own_form_imports_what_registers_the_id():
     """,
     )
     assert get_task("more_ids.py:MyOwn-v5").horizon == 80
-    with pytest.raises(TaskError, match="my_ids has no 'MyOwn-v4', nor registers it; define it there"):
+    with pytest.raises(TaskError, match="my_ids neither defines nor registers 'MyOwn-v4'; define it there"):
         get_task("my_ids:MyOwn-v4")
 
 

@@ -145,7 +145,7 @@ def test_a_task_out_of_a_module(file, monkeypatch):
     ("name", "message"),
     [
         ("{file}:nothing", "mine.py has no 'nothing'"),
-        ("{file}:number", "expected a metrpo.Task or a function that makes an environment, got 7"),
+        ("{file}:number", "expected a metrpo.Task or a function that creates an environment, got 7"),
         ("nowhere.py:task", "expected a Python file at .*nowhere.py, found none"),
         ("no_such_module:task", "expected a module no_such_module .* found none"),
     ],
@@ -242,9 +242,9 @@ BROKEN = {
         broken(step=lambda self, a: (np.zeros(3, np.float32), 0.0, 0.3, False, {})),
         "expected a bool as terminated, got 0.3",
     ),
-    "no time limit": (Env, "Mine: expected an environment with a time limit, got none: .*horizon="),
+    "no time limit": (Env, "Mine: expected an environment with a time limit, got none; .*horizon="),
     "no environment at all": (lambda **kw: 7, "Mine: expected a gymnasium.Env, got int"),
-    "an exception in its making": (broken(__init__=raising), "Mine: cannot be made .TypeError"),
+    "an exception in its making": (broken(__init__=raising), "Mine: cannot create the environment .TypeError"),
 }
 
 

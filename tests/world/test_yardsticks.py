@@ -49,7 +49,7 @@ def test_long_episodes_are_played_less_often(monkeypatch, horizon, episodes):
 
 def test_a_run_says_what_evaluation_cuts(caplog):
     training.check(CONFIG, dataclasses.replace(probe.PROBE, horizon=10_001))
-    assert "Probe: episodes of up to 10,001 steps: evaluation cuts them after 10,000" in caplog.text
+    assert "Probe: episodes have up to 10,001 steps; evaluation cuts them after 10,000" in caplog.text
 
 
 class Heard(Progress):
@@ -88,7 +88,7 @@ def test_a_run_killed_before_its_first_checkpoint_measures_once(tmp_path):
     with RunDirectory(tmp_path, elsewhere) as run:
         run.episodes.append(probe_episode())
     training.train(elsewhere, tmp_path, again)
-    assert again.lines[-1] == f"resuming {tmp_path} at iteration 1 of 3, 0 real steps and 20 that wait"
+    assert again.lines[-1] == f"resuming {tmp_path} at iteration 1 of 3, 0 real steps and 20 new ones"
 
 
 def probe_episode():

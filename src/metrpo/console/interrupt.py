@@ -1,6 +1,6 @@
-"""Ctrl-C and SIGTERM while a run goes on: the first lets it finish its step, the second breaks it off.
+"""Ctrl-C and SIGTERM during a run: the first one lets it finish its step, the second stops it at once.
 
-Neither loses anything that is on disk (see `metrpo.run.directory`); the first saves what has been computed as well.
+Neither loses anything on disk (see `metrpo.run.directory`); the first also saves what has been computed.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from typing import Any, Self
 from metrpo.console.progress import Measured, Progress, TolerantProgress
 
 PATIENCE = 5.0
-"""Seconds that an episode has to end in when a signal asks to stop."""
+"""Seconds that an episode has to end after a signal."""
 
 
 class Stopped(BaseException):
-    """A signal has stopped the work."""
+    """A signal stopped the work."""
 
     def __init__(self, number: int) -> None:
         super().__init__(signal.Signals(number).name)
@@ -31,15 +31,15 @@ _PROCESS = os.getpid()
 
 
 def stop(number: int, frame: FrameType | None = None) -> None:
-    """A signal handler that stops at once, by raising `Stopped`, in the process of the command only."""
+    """A signal handler that raises `Stopped` at once, only in the process of the command."""
     if not _inherited(number, _PROCESS):
         raise Stopped(number)
 
 
 def _inherited(number: int, process: int) -> bool:
-    """Whether this is not `process`, which installed the handler, but a fork of it: there the signal ends it as usual.
+    """Whether this is a fork of `process`, which installed the handler. The signal ends a fork as usual.
 
-    An environment that runs in children of ours ends them so, and waits for them.
+    An environment with child processes ends them by signals, and waits for them.
     """
     if os.getpid() == process:
         return False
@@ -49,11 +49,11 @@ def _inherited(number: int, process: int) -> bool:
 
 
 class Interruptible(TolerantProgress):
-    """Progress that the loop reports to within a `with` block, and that ends the loop by `Stopped` once asked to.
+    """Progress for a `with` block that ends the training loop with `Stopped` after a signal.
 
-    An iteration that has begun is finished and saved first. While real episodes are played, of which each is saved as
-    it ends (`keeps_episodes`), only the episode is, if it ends within `PATIENCE` seconds: a longer one is given up, and
-    the same command plays it anew. Before and after, and when asked once more, it ends at once.
+    The iteration under way is finished and saved first. While real episodes are played, each of which is saved as it
+    ends (`keeps_episodes`), only the episode is finished, if it ends within `PATIENCE` seconds. A longer one is
+    discarded, and the same command plays it anew. Between iterations, and at a second signal, the loop ends at once.
     """
 
     def __init__(self, shown: Progress, keeps_episodes: bool = True) -> None:
@@ -62,18 +62,18 @@ class Interruptible(TolerantProgress):
         self._asked: int | None = None
         self._asked_at = 0.0
         self._stage: str | None = None
-        """What would be lost by stopping now; None: nothing."""
+        """The stage that stopping now would lose; None: nothing."""
         self._before: dict[int, Any] = {}
         self._process = os.getpid()
         self.began = False
         """Whether an iteration has begun."""
         self.ended = False
-        """Whether the last one that began is saved."""
+        """Whether the last iteration that began is saved."""
 
     def __enter__(self) -> Self:
         self._process = os.getpid()
         for number in (signal.SIGINT, signal.SIGTERM):
-            # A shell lets what it starts in the background ignore Ctrl-C: it stays so.
+            # A shell makes background commands ignore Ctrl-C: leave that as it is.
             if signal.getsignal(number) is not signal.SIG_IGN:
                 self._before[number] = signal.signal(number, self._ask)
         return self
@@ -89,17 +89,17 @@ class Interruptible(TolerantProgress):
             raise Stopped(number)
         self._asked, self._asked_at = number, time.monotonic()
         step = "episode" if self._collecting() else "iteration"
-        text = f"\nmetrpo: stopping after this {step}; once more stops at once, and loses this {step} only\n"
+        text = f"\nmetrpo: stopping after this {step}; press again to stop at once and lose only this {step}\n"
         with contextlib.suppress(OSError):
-            os.write(2, text.encode())  # print may be what the signal has interrupted
+            os.write(2, text.encode())  # the signal may have interrupted print
 
     def begin(self, iteration: int, of: int | None) -> None:
-        """From the first stage on something is under way."""
+        """An iteration begins; from its first stage on, stopping loses work."""
         self.began, self.ended = True, False
         super().begin(iteration, of)
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """Between collecting and learning nothing is that is not on disk."""
+        """A stage begins. Between collecting and learning, everything is on disk: a place to stop."""
         if self._collecting():
             self._stop_if_asked()
         self._stage = name
@@ -112,7 +112,7 @@ class Interruptible(TolerantProgress):
             self._stop_if_asked()
 
     def played(self) -> None:
-        """An episode that takes too long is given up: nobody waits for hours."""
+        """A step is played. An episode that takes too long is discarded, so that nobody waits for hours."""
         if self._asked is not None and self._collecting() and time.monotonic() - self._asked_at > PATIENCE:
             self._stop_if_asked()
 
@@ -123,7 +123,7 @@ class Interruptible(TolerantProgress):
         self._stop_if_asked()
 
     def close(self) -> None:
-        """Nothing is under way any more."""
+        """The run ends; no stage is under way."""
         super().close()
         self._stage = None
 

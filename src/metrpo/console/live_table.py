@@ -1,4 +1,4 @@
-"""Many runs at a glance in the terminal: where each stands, what it earns, whether it lives."""
+"""Many runs at a glance in the terminal: progress, returns, warnings, running or stopped."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from metrpo.run.metrics import numbers
 
 SPARKS = "▁▂▃▄▅▆▇█"
 _WIDE = 170
-"""Columns of a table that does not go to a terminal."""
+"""Width of a table that is not printed on a terminal, in characters."""
 _COLUMNS = (
     "run", "task", "system", "preset", "seed", "changed", "iteration", "real steps", "return", "best", "gap", "so far",
     "warnings", "s/iteration", "left", "state",
 )  # fmt: skip
 _SPARE = ("s/iteration", "best", "preset", "real steps", "gap", "left", "so far", "system", "changed", "seed", "run")
-"""Columns that a narrow terminal goes without, first ones first."""
+"""Columns that a narrow terminal drops, first ones first."""
 _RECENT = 3
-"""Iterations whose median duration says how long the next ones take: they grow with the data."""
+"""Number of last iterations whose median duration predicts the next ones (durations grow with the data)."""
 
 
 @dataclass(frozen=True)
 class Standing:
-    """Where a run stands, for the table and for scripts; None is unknown."""
+    """The status of a run, for the table and for scripts; None is unknown."""
 
     path: str
     task: str
@@ -47,33 +47,33 @@ class Standing:
     preset: str
     seed: int
     changed: dict[str, str]
-    """Settings in which it differs from other runs of its task, system and preset."""
+    """Settings that other runs of its task, system and preset have otherwise."""
     state: str
     """running, finished or stopped."""
     iteration: int
     iterations: int | None
-    """About how many there will be."""
+    """Expected number of iterations."""
     real_steps: int
-    """Learned from."""
+    """Real steps that it has learned from."""
     waiting_steps: int
-    """Collected, and not learned from yet."""
+    """Collected real steps that it has not learned from yet."""
     return_real: float | None
     return_best: float | None
     gap: float | None
     returns: list[float | None]
     return_collected: float | None
-    """Of the last iteration's episodes, with exploration noise."""
+    """Return of the last iteration's episodes, with exploration noise."""
     returns_collected: list[float | None]
     warnings: int
     notes: int
     seconds_per_iteration: float | None
     seconds_left: float | None
     seconds_since: float | None
-    """Since something was written."""
+    """Seconds since a file was last written."""
 
 
 def standing(run: SeenRun, now: float | None = None, changed: Mapping[str, str] | None = None) -> Standing:
-    """Where a run stands; `now` is the time of day in seconds, `changed` what tells it from others (`told_apart`)."""
+    """The status of a run; `now` is the time in seconds, `changed` what tells it from other runs (`told_apart`)."""
     config, rows = run.config, run.rows
     real, collected, concerns = (
         run.column("return_real"),
@@ -115,7 +115,7 @@ def standing(run: SeenRun, now: float | None = None, changed: Mapping[str, str] 
 def is_running(run_dir: Path) -> bool:
     """Whether a process holds the run's lock (see `metrpo.run.lock`), without touching that lock.
 
-    Only this machine's processes are seen: a run on another one that shares the disk looks stopped.
+    This sees only the processes of this machine: a run on another one that shares the disk looks stopped.
     """
     lock = run_dir / ".lock"
     try:
@@ -124,19 +124,19 @@ def is_running(run_dir: Path) -> bool:
     except (OSError, UnicodeDecodeError):
         return _is_alive(lock)
     for words in held:
-        # 1: FLOCK ADVISORY WRITE 4711 fe:00:123456 0 EOF; one that waits has "->" and no file of its own.
+        # 1: FLOCK ADVISORY WRITE 4711 fe:00:123456 0 EOF; a waiting one has "->" and no file of its own.
         if len(words) < 6 or words[5].count(":") != 2 or words[1] == "->":
             continue
         major, minor, inode = words[5].split(":")
         here = (int(major, 16), int(minor, 16)) == (os.major(file.st_dev), os.minor(file.st_dev))
-        # Layered file systems show another device than the one that stat does.
+        # Layered file systems show another device here than stat does.
         if int(inode) == file.st_ino and (here or words[4] == holder):
             return True
     return False
 
 
 def _is_alive(lock: Path) -> bool:
-    """Where the system does not show its locks: whether the process that wrote the file is there."""
+    """Where the system does not list its locks: whether the process that wrote the file is alive."""
     try:
         os.kill(int(lock.read_text()), 0)
     except (OSError, ValueError):
@@ -145,7 +145,7 @@ def _is_alive(lock: Path) -> bool:
 
 
 def sparkline(values: Sequence[float | None], width: int = 12) -> str:
-    """A history as at most `width` small bars, from its least to its largest value; a gap where there is none."""
+    """A history as at most `width` small bars, from its least to its largest value; missing values are gaps."""
     whole = numbers(values)
     parts = np.array_split(whole, min(width, len(whole)) or 1)
     shown = [float(np.mean(f)) if len(f := part[np.isfinite(part)]) else math.nan for part in parts]
@@ -158,12 +158,12 @@ def sparkline(values: Sequence[float | None], width: int = 12) -> str:
 
 
 def standings_of(runs: Sequence[SeenRun]) -> list[Standing]:
-    """Where each of some runs stands, and what tells it from the others."""
+    """The status of each run, and the settings that tell it from the others."""
     return [standing(run, changed=changed) for run, changed in zip(runs, told_apart(runs), strict=True)]
 
 
 def table(found: FoundRuns, console: Console) -> Group:
-    """One line a run, running ones first, and below it what could not be read; columns as far as there is room."""
+    """One line per run, running ones first, with as many columns as fit; below, the runs that cannot be read."""
     order = ("running", "stopped", "finished")
     standings = sorted(standings_of(found.runs), key=lambda s: order.index(s.state))
     columns = [name for name in _COLUMNS if name != "changed" or any(s.changed for s in standings)]
@@ -173,7 +173,7 @@ def table(found: FoundRuns, console: Console) -> Group:
             break
         columns = [name for name in columns if name != spare]
         grid = _grid(columns, standings)
-    below = [Text(f"cannot be read: {skipped.why}", style="yellow", overflow="fold") for skipped in found.skipped]
+    below = [Text(f"skipped: {skipped.why}", style="yellow", overflow="fold") for skipped in found.skipped]
     return Group(grid, *below)
 
 
@@ -185,13 +185,13 @@ def _grid(columns: Sequence[str], standings: Sequence[Standing]) -> Table:
     names = _names([s.path for s in standings])
     for s in standings:
         cells = _cells(s) | {"run": (names[s.path], "")}
-        # What a run directory says must not be read as markup.
+        # Text from a run directory must not be read as markup.
         grid.add_row(*(Text(*cells[name]) for name in columns))
     return grid
 
 
 def watch(paths: Sequence[Path], every: float, once: bool, console: Console | None = None) -> None:
-    """Shows the table, again and again until Ctrl-C unless `once`; runs that begin meanwhile come in.
+    """Shows the table, and updates it until Ctrl-C unless `once`; new runs are added.
 
     Raises `RunDirectoryError` when there is nothing to watch at first.
     """
@@ -214,7 +214,7 @@ def watch(paths: Sequence[Path], every: float, once: bool, console: Console | No
 
 
 def _names(paths: Sequence[str]) -> dict[str, str]:
-    """The paths without the folders that all share."""
+    """The paths without the folder that all share."""
     if len(paths) == 1:
         return {paths[0]: Path(paths[0]).name or paths[0]}
     try:
@@ -227,7 +227,7 @@ def _names(paths: Sequence[str]) -> dict[str, str]:
 def _cells(s: Standing) -> dict[str, tuple[str, str]]:
     """Text and style by column."""
     colour = {"running": "green", "stopped": "red", "finished": "dim"}[s.state]
-    # Only another program can play: a robot's, say.
+    # Only another program plays, on a robot, say.
     is_robots = all(r is None for r in s.returns) and s.return_collected is not None
     since = f" {duration(s.seconds_since)} ago" if s.state == "stopped" and s.seconds_since is not None else ""
     return {
@@ -250,14 +250,14 @@ def _cells(s: Standing) -> dict[str, tuple[str, str]]:
 
 
 def _total(run: SeenRun) -> int | None:
-    """Iterations when the budget will be spent."""
+    """Number of iterations when the budget is spent."""
     done, steps = (int(run.rows[-1][name] or 0) if run.rows else 0 for name in ("iteration", "real_steps"))
     left = budget.iterations_left(run.config, done, steps)
     return None if left is None else done + left
 
 
 def _seconds(run: SeenRun) -> float | None:
-    """How long the next iteration takes, by the last ones; None without a clock."""
+    """Seconds of the next iteration, predicted from the last ones; None without a clock."""
     wall = np.append(0.0, run.column("wall_seconds"))[-_RECENT - 1 :]
     steps = np.diff(wall)
     if len(steps) == len(run.rows) > 1:
@@ -266,7 +266,7 @@ def _seconds(run: SeenRun) -> float | None:
 
 
 def _written(folder: Path) -> float | None:
-    """When something was last written: an episode, or a whole iteration."""
+    """When a file was last written: an episode, or a whole iteration."""
     times = []
     for path in (folder / "metrics.csv", folder / "episodes", folder / "run.json"):
         try:

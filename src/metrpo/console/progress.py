@@ -1,4 +1,4 @@
-"""What a person sees while a run goes on: a live display on a terminal, plain lines elsewhere, or nothing."""
+"""Progress of a run: a live display on a terminal, plain lines elsewhere, or nothing."""
 
 from __future__ import annotations
 
@@ -25,32 +25,32 @@ Measured = Mapping[str, Any]
 
 
 class Progress:
-    """Told by the training loop where it stands. This one shows nothing; the others override what they show."""
+    """The training loop reports to it. This one shows nothing; subclasses override what they show."""
 
     def say(self, text: str) -> None:
-        """Something about the run that is worth a line."""
+        """One line about the run."""
 
     def resume(self, where: str, iteration: int, of: int | None, real_steps: int, waiting: int = 0) -> None:
-        """A run is taken up: `iteration` of `of` comes next, after so many real steps; it has `waiting` of its own."""
+        """A run resumes: `iteration` of `of` comes next, after `real_steps` and `waiting` new ones."""
         self.say(_resuming(where, iteration, of, real_steps, waiting))
 
     def begin(self, iteration: int, of: int | None) -> None:
         """Outer iteration `iteration` (from 1) of `of` (None: unknown) begins."""
 
     def stage(self, name: str, total: int | None = None) -> None:
-        """A stage such as "fit" begins, of at most `total` units (None: unknown)."""
+        """A stage such as "fit" begins, with at most `total` units of work (None: unknown)."""
 
     def update(self, done: int, note: str = "") -> None:
-        """`done` units of the stage are behind; `note` is a short remark such as a loss."""
+        """`done` units of the stage are finished; `note` is a short remark, such as a loss."""
 
     def played(self) -> None:
-        """One more real step has been played, in the middle of an episode; a place to stop."""
+        """One more real step has been played, within an episode; a place to stop."""
 
     def end(self, row: Measured, seconds_left: float | None = None) -> None:
-        """The iteration is finished with these metrics; about so many seconds remain."""
+        """The iteration is finished, with the metrics `row`; about `seconds_left` remain for the run."""
 
     def close(self) -> None:
-        """The run is over, or breaks off."""
+        """The run ends, finished or not."""
 
 
 SILENT = Progress()
@@ -141,7 +141,7 @@ class LiveProgress(Progress):
 
 
 class TolerantProgress(Progress):
-    """Another progress, of which nothing is shown any more once it fails: a closed pipe must not cost hours."""
+    """Wraps another progress and falls silent once that fails: a closed pipe must not cost hours of training."""
 
     def __init__(self, shown: Progress) -> None:
         self._shown = shown
@@ -178,14 +178,14 @@ class TolerantProgress(Progress):
             self._shown = SILENT
             with contextlib.suppress(Exception):
                 shown.close()
-            _log.warning("no progress from here on (%s: %s); training goes on", type(error).__name__, error)
+            _log.warning("progress is not shown any more (%s: %s); training continues", type(error).__name__, error)
             if isinstance(error, OSError):
-                _mute(sys.stdout)  # the reader is gone, or the disk full: what follows would fail as well
+                _mute(sys.stdout)  # the reader is gone, or the disk is full: later writes would fail too
             mute_broken_output()
 
 
 def mute_broken_output() -> None:
-    """Lets what is printed from here on vanish, where stdout or stderr cannot be written: `metrpo train ... | head`."""
+    """Discards later output where stdout or stderr cannot be written, as in `metrpo train ... | head`."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()
@@ -194,7 +194,7 @@ def mute_broken_output() -> None:
 
 
 def _mute(stream: TextIO) -> None:
-    with contextlib.suppress(OSError, ValueError):  # it is no file, or closed
+    with contextlib.suppress(OSError, ValueError):  # not a file, or closed
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
         os.close(nowhere)
@@ -206,27 +206,27 @@ def default_progress() -> Progress:
 
 
 def library_progress() -> Progress:
-    """What a program that trains shows: a live display in a terminal or a notebook, and nothing elsewhere."""
+    """The progress of a program that trains: a live display in a terminal or a notebook, nothing elsewhere."""
     if _is_notebook():
         return TolerantProgress(LiveProgress() if importlib.util.find_spec("ipywidgets") else PlainProgress())
     return TolerantProgress(LiveProgress()) if sys.stdout is not None and sys.stdout.isatty() else SILENT
 
 
 def _is_notebook() -> bool:
-    """Whether cells are run: in Jupyter, Colab and the like, not in IPython on a terminal."""
+    """Whether this is Jupyter, Colab or the like, rather than IPython on a terminal."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return type(shell).__name__ not in ("NoneType", "TerminalInteractiveShell")
 
 
 def summary(row: Measured) -> str:
-    """One line with the numbers of an iteration that a person follows."""
+    """The main metrics of an iteration in one line."""
     parts = [
         f"{row.get('real_steps', 0):>7,} real steps",
         f"return {_number(row.get('return_real')):>7} ± {_number(row.get('return_real_std'))}",
     ]
     if _is_missing(row.get("return_real")):
         parts[1] = f"collected {_number(row.get('return_collected')):>7}"
-        if row.get("failed_evaluation"):  # else only another program can play
+        if row.get("failed_evaluation"):  # else only another program plays
             parts[1] = f"evaluation failed, {parts[1]}"
     if "return_imagined" in row:
         parts.append(f"imagined {_number(row['return_imagined']):>7}")
@@ -235,7 +235,7 @@ def summary(row: Measured) -> str:
 
 
 def outcome(row: Measured, run_dir: Path) -> str:
-    """What the last iteration says of a whole run, in a line."""
+    """The result of a run in one line, from its last iteration."""
     after = f"after {row['real_steps']:,} real steps"
     if not _is_missing(row.get("return_real")):
         return f"return {_number(row['return_real'])} ± {_number(row.get('return_real_std'))} {after}"
@@ -243,17 +243,17 @@ def outcome(row: Measured, run_dir: Path) -> str:
         return f"collected {_number(row.get('return_collected'))} {after}"
     return (
         f"no return {after}: the last evaluation failed, as the warning above says; "
-        f"where it fails: metrpo evaluate {shlex.quote(str(run_dir))}"
+        f"to see where: metrpo evaluate {shlex.quote(str(run_dir))}"
     )
 
 
 def _has_no_environment(row: Measured) -> bool:
-    """Only another program can play."""
+    """Whether only another program plays."""
     return not row.get("failed_evaluation") and "return_imagined" in row
 
 
 def earned(row: Measured) -> str:
-    """The real return of an iteration, or what was collected where only another program can play."""
+    """The real return of an iteration, or the collected one where only another program plays."""
     if _is_missing(row.get("return_real")):
         return f"collected {_number(row.get('return_collected'))}"
     return f"return {_number(row.get('return_real'))}"
@@ -276,9 +276,9 @@ def duration(seconds: float) -> str:
 def _resuming(where: str, iteration: int, of: int | None, real_steps: int, waiting: int) -> str:
     steps = counted(real_steps, "real step")
     if of is not None and iteration > of:
-        return f"{where} is finished: {counted(of, 'iteration')}, {steps}; a larger budget goes on"
+        return f"{where} is finished: {counted(of, 'iteration')}, {steps}; raise the budget to continue it"
     budget = "" if of is None else f" of {of}"
-    collected = f" and {waiting:,} that wait" if waiting else ""
+    collected = f" and {waiting:,} new ones" if waiting else ""
     return f"resuming {where} at iteration {iteration}{budget}, {steps}{collected}"
 
 

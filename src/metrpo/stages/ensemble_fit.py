@@ -1,4 +1,4 @@
-"""The ensemble fitted to all real transitions, with members that diverge made anew."""
+"""Fits the ensemble to all real transitions; members that diverge start anew."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ def fit_ensemble(
 
     ensemble, info = fit(networks, normaliser, train, validation, config.fit, fit_key, tell)
     if (survived := info.diverged & ~info.lost).any():
-        _log.warning("fit, iteration %d: %s diverged, and keep their best weights", iteration, _named(survived))
+        _log.warning("fit, iteration %d: %s diverged and kept their best weights", iteration, _named(survived))
     if info.lost.any():
-        _log.warning("fit, iteration %d: %s diverged: re-initialised and fitted again", iteration, _named(info.lost))
+        _log.warning("fit, iteration %d: %s diverged; re-initialised and fitted again", iteration, _named(info.lost))
         init_key, fit_key = jax.random.split(key_of(config.seed, iteration, Stage.RESET))
         fresh = fresh_networks(config, task, init_key)
         ensemble, info = refit(ensemble, info, fresh, train, validation, config.fit, fit_key)
@@ -53,8 +53,8 @@ def fit_ensemble(
         largest = float(np.abs(dataset.train.deltas).max())
         raise DivergedError(
             f"fit, iteration {iteration}: {_named(info.lost)}: expected finite weights and losses, got others, twice; "
-            f"start anew with a lower fit.learning_rate than {config.fit.learning_rate}, or look for outliers in the "
-            f"data (its largest change of a state is {largest:.3g})"
+            f"start anew with fit.learning_rate below {config.fit.learning_rate}, or look for outliers in the data "
+            f"(largest change of a state: {largest:.3g})"
         )
     return ensemble._replace(carried=Carried(task.carried)), info
 
@@ -64,6 +64,6 @@ def _named(members: np.ndarray) -> str:
 
 
 def fresh_networks(config: Config, task: Task, key: Array) -> Networks:
-    """Networks that have seen nothing."""
+    """Networks with fresh weights."""
     e = config.ensemble
     return ensembles.init(key, e.members, task.state_size, task.action_size, e.hidden, task.predicted)

@@ -1,7 +1,7 @@
-"""The policy that real episodes have proven best, which a run goes back to where its models were wrong.
+"""The policy that real episodes have proven best; a run goes back to it where its models were wrong.
 
-The ensemble's vote knows the models only: where all of them err alike, it accepts a policy that earns less. A few real
-episodes without noise tell. They are part of an iteration's real steps, and the models learn from them as from others.
+The ensemble's vote knows only the models: where all of them err alike, it accepts a policy that earns less. A few real
+episodes without noise show it. They count as real steps of the iteration, and the models learn from them too.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from metrpo.world.task import Task
 
 _log = logging.getLogger("metrpo")
 ERRORS = 2.0
-"""Standard errors of the difference of two means that say that one policy earns less."""
+"""One policy earns less than another if their mean returns differ by this many standard errors."""
 
 
 class Verdict(NamedTuple):
-    """What a policy's real episodes said."""
+    """The result of a policy's real episodes."""
 
     best: Proven
     given_up: bool
@@ -74,7 +74,7 @@ def prove(config: Config, task: Task, before: State, progress: Progress, log: Lo
                 episodes.append(episode)
                 log.append(episode, proof=True)
     except EpisodeError as error:
-        _log.warning("%s; the policy is judged by the %d episodes before", error, len(episodes))
+        _log.warning("%s; the policy is judged by the %d episodes before it", error, len(episodes))
     return episodes
 
 

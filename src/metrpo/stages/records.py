@@ -1,4 +1,4 @@
-"""What is kept of an iteration and nothing is learned from: its row of metrics. It may fail without harm."""
+"""The record of an iteration: its row of metrics. Nothing is learned from it, and it may fail without harm."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from metrpo.world.task import Task
 
 _log = logging.getLogger("metrpo")
 EVALUATION_STEPS = 200_000
-"""Real steps of one evaluation after which no other episode begins: a record must not take longer than learning."""
+"""Real steps of one evaluation after which no new episode begins: evaluation must not take longer than learning."""
 T = TypeVar("T")
 
 
 class Real(NamedTuple):
-    """What an iteration has of the real environment besides the episodes that it learns from."""
+    """What an iteration gets from the real environment, besides the episodes that it learns from."""
 
     failed: int = 0
     """Episodes left out because the environment failed in them."""
@@ -64,15 +64,15 @@ class Done(NamedTuple):
 
 
 def recorded(what: str, iteration: int, record: Callable[[], T], failed: T) -> T:
-    """What `record()` gives; where it fails, `failed` and a warning that says why: no record may cost what is learned.
+    """The result of `record()`; where it fails, `failed` and a warning, so that no record costs what was learned.
 
-    Not so when the run is to stop (`console.interrupt.Stopped`).
+    `console.interrupt.Stopped` passes through.
     """
     try:
         return record()
     except Exception as error:
         why = str(error) if isinstance(error, MetrpoError) else f"{type(error).__name__}: {error}"
-        _log.warning("iteration %d has no %s (%s); what it has learned is kept", iteration, what, why)
+        _log.warning("iteration %d has no %s (%s); what it learned is kept", iteration, what, why)
         return failed
 
 
@@ -125,8 +125,8 @@ def evaluate(
 
     The policy sees states less `origin` [S].
 
-    Fewer where they have `EVALUATION_STEPS` together; each is cut after `RECORDED` steps. One NaN for a task that only
-    another program can play.
+    Fewer episodes where they reach `EVALUATION_STEPS`; each is cut after `RECORDED` steps. One NaN for a task that only
+    another program plays.
     """
     if not task.playable:
         return np.array([math.nan])
@@ -139,7 +139,7 @@ def evaluate(
 def record(config: Config, task: Task, state: State, done: Done) -> Row:
     """The row of the iteration that ended in `state`, but for its seconds.
 
-    What only records cannot fail: it is NaN then, with a warning.
+    A measurement that fails is NaN, with a warning.
     """
     iteration, dataset = state.iteration, state.dataset
     diagnosis = _diagnosis(config, task, state, done.ensemble)
@@ -167,7 +167,7 @@ def _outcome(state: State, returns: np.ndarray, done: Done, cut: bool) -> Row:
         "return_real_std": float(np.std(returns)),
         "return_collected": collected,
         "return_imagined": imagined,
-        # What episodes of different lengths earn cannot be compared.
+        # Returns of episodes of different lengths cannot be compared.
         "gap": math.nan if cut else imagined - float(np.mean(returns)),
         **{f"validation_loss_{k}": float(loss) for k, loss in enumerate(losses)},
         "train_loss": float(np.mean(fitted.train_loss)),

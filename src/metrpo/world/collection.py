@@ -40,11 +40,11 @@ def collect(
     longest: int | None = None,
     at_most: float = math.inf,
 ) -> list[Episode]:
-    """Whole episodes of `at_least` steps together; `draw_act(rng)` acts in one episode and brings its own noise.
+    """Plays whole episodes until they have `at_least` steps in all; `draw_act(rng)` acts in one, with noise.
 
-    An episode of more than `longest` steps is cut there, and so is the one that reaches `at_most` steps of all
-    together. One in which the environment gives NaN or infinity is left out, with a warning. `on_episode(steps so far)`
-    follows every other.
+    An episode is cut after `longest` steps, and where all episodes reach `at_most` steps. An episode in which the
+    environment gives NaN or infinity is left out, with a warning; after every other one, `on_episode(steps so far)` is
+    called.
 
     Raises `UnplayableError` when more than `MOST_FAILURES` are left out, `TaskError` as `play`.
     """
@@ -64,14 +64,14 @@ def collect(
 
 
 def leave_out(failed: int, error: EpisodeError) -> None:
-    """Says that an episode, the `failed`-th of its collection, is left out.
+    """Warns that an episode, the `failed`-th of its collection, is left out.
 
     Raises `UnplayableError` when there have been too many.
     """
     if failed > MOST_FAILURES:
-        text = f"{error}. {MOST_FAILURES} episodes before it failed too: repair the environment, then go on"
+        text = f"{error}. {MOST_FAILURES} episodes before it failed too: repair the environment, then resume"
         raise UnplayableError(text) from error
-    _log.warning("%s; this episode is left out (number %d of at most %d)", error, failed, MOST_FAILURES)
+    _log.warning("%s; this episode is left out (%d of at most %d)", error, failed, MOST_FAILURES)
 
 
 def play(
@@ -192,14 +192,14 @@ def _episode(
     )
 
 
-def action_of(task: Task, given: np.ndarray, where: str, before: np.ndarray | None = None) -> np.ndarray:
-    """The action [A], within the task's limits, that a policy of `task` has `given` after the action `before`.
+def action_of(task: Task, output: np.ndarray, where: str, before: np.ndarray | None = None) -> np.ndarray:
+    """The action [A], within the task's limits, from a policy's `output` after the action `before`.
 
     Raises `TaskError` when its size is another than the task's, `DivergedError` when it holds NaN.
     """
-    array = env_returns.array_of(given)
+    array = env_returns.array_of(output)
     if array is None or array.size != task.action_size or array.ndim > 1:
-        got = f"{given!r}" if array is None else f"shape {list(array.shape)}"
+        got = f"{output!r}" if array is None else f"shape {list(array.shape)}"
         raise TaskError(
             f"{task.name}: {where}: expected an action of {counted(task.action_size, 'number')}, got {got}; use a "
             "policy that was made for this task"
@@ -208,14 +208,14 @@ def action_of(task: Task, given: np.ndarray, where: str, before: np.ndarray | No
     if np.isnan(action).any():
         raise DivergedError(
             f"{task.name}: {where}: expected numbers as action, got {action.tolist()}; "
-            "the policy has diverged: go back to one from before, or start anew"
+            "the policy has diverged: use an earlier one, or start anew"
         )
     return action
 
 
 @contextmanager
 def _of_episode(where: str = "") -> Iterator[None]:
-    """What goes wrong in a call of the environment is an `EpisodeError` that says `where`."""
+    """Turns an error of the environment into an `EpisodeError` that says `where`."""
     try:
         yield
     except TaskError as error:
@@ -230,11 +230,11 @@ def _start(task: Task, env: gymnasium.Env, seed: int) -> np.ndarray:
 
 
 def _numbers(task: Task, where: str, observation: Any, reward: float) -> np.ndarray:
-    """The observation as a state [S]; not every environment is `Guarded`: those of a `Task` may come as they are."""
+    """The observation as a state [S]. (A `Task`'s own environment may not be `Guarded`.)"""
     state = env_returns.array_of(observation)
     if state is None or state.shape != (task.state_size,):
         got = observation if state is None else f"shape {list(state.shape)}"
-        advice = "return an array of so many numbers, or make the task by metrpo.task_of, which flattens others"
+        advice = "return an array of that many numbers, or create the task with metrpo.task_of, which flattens others"
         expected = f"an observation of {counted(task.state_size, 'number')}"
         raise env_returns.broken(task.name, where, expected, got, advice, EpisodeError)
     for what, value in (("observation", state), ("reward", reward)):

@@ -1,4 +1,4 @@
-"""What a real environment returns, held to Gymnasium's promises; every call of any environment goes through here."""
+"""Checks that a real environment returns what Gymnasium promises; every call of an environment goes through here."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from metrpo.errors import MetrpoError, TaskError
 _log = logging.getLogger("metrpo")
 Env = TypeVar("Env", bound=Any)
 _MOST = float(np.finfo(np.float32).max) / 2
-"""Beyond this the difference of two numbers may be infinite in float32, in which everything is learned."""
+"""Beyond this, the difference of two numbers may be infinite in float32, in which everything is learned."""
 
 
 _LONGEST = 100
-"""Characters of what an environment has given, in a message."""
+"""Most characters of a returned value in a message."""
 
 
 def representable(values: Any) -> bool:
-    """Whether all are finite, and stay so in float32 when one is taken from another."""
+    """Whether all are finite, and so are their differences in float32."""
     return bool(np.all(np.abs(values) <= _MOST))  # false for NaN
 
 
@@ -70,9 +70,9 @@ def broken(
 
 @contextmanager
 def closing(env: Env, name: str) -> Iterator[Env]:
-    """Closes an environment after the block; one that cannot be closed costs a warning, for its work is done.
+    """Closes an environment after the block. One that cannot be closed gives a warning, for its work is done.
 
-    Within `warning_once` it costs one for all.
+    Within `warning_once`, the same warning is given once.
     """
     try:
         yield env
@@ -81,28 +81,28 @@ def closing(env: Env, name: str) -> Iterator[Env]:
             env.close()
         except Exception as error:
             text = f"{name}: close() raised {type(error).__name__}: {error}"
-            if _told is None or not _told[text]:
-                _log.warning("%s; nothing is lost by that", text)
-            if _told is not None:
-                _told[text] += 1
+            if _warned is None or not _warned[text]:
+                _log.warning("%s; nothing is lost", text)
+            if _warned is not None:
+                _warned[text] += 1
 
 
-_told: Counter[str] | None = None
-"""How often a warning was due since `warning_once` began."""
+_warned: Counter[str] | None = None
+"""How often each warning was due since `warning_once` began."""
 
 
 @contextmanager
 def warning_once() -> Iterator[None]:
-    """Every warning of `closing` is given once in this block, and counted at its end."""
-    global _told
-    _told, before = Counter(), _told
+    """Gives every warning of `closing` once in this block, and counts them at its end."""
+    global _warned
+    _warned, before = Counter(), _warned
     try:
         yield
     finally:
-        for text, times in _told.items():
+        for text, times in _warned.items():
             if times > 1:
                 _log.warning("%s, %d times in all", text, times)
-        _told = before
+        _warned = before
 
 
 def _call(name: str, what: str, call: Callable[[], Any]) -> Any:
@@ -113,7 +113,7 @@ def _call(name: str, what: str, call: Callable[[], Any]) -> Any:
     except Exception as error:
         raise TaskError(
             f"{name}: {what}() raised {type(error).__name__}: {error}; "
-            "make the environment run by itself first (gymnasium.utils.env_checker.check_env helps)"
+            "first make the environment run by itself (gymnasium.utils.env_checker.check_env helps)"
         ) from error
 
 

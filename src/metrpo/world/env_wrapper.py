@@ -73,7 +73,7 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
     def step(self, action: NDArray[np.float32]) -> tuple[NDArray[np.float64], float, bool, bool, dict[str, Any]]:
         """One step with an action in [-1, 1]: state [S], reward, terminated, truncated, info."""
         if self._over:
-            raise TaskError(f"{self._name}: step() was called after the end of an episode: call reset() first")
+            raise TaskError(f"{self._name}: expected reset() after the end of an episode, got step()")
         given = self._rescaled(action)
         observation, reward, terminated, truncated, info = env_returns.after_step(
             self._name, lambda: self._env.step(given)

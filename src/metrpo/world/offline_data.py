@@ -35,11 +35,11 @@ def load(path: str | Path, task: Task) -> list[Episode]:
 
 def _read(path: str | Path, task: Task) -> list[Episode]:
     if not Path(path).exists():
-        raise TaskError(f"{path}: there is no such file; expected an .npz of {', '.join(ARRAYS)}")
+        raise TaskError(f"{path}: expected an .npz of {', '.join(ARRAYS)}, got no such file")
     with opened(Path(path), TaskError) as file:
         found = arrays_of(file, Path(path), TaskError, compressed=True, only=ARRAYS)
     if missing := [name for name in ARRAYS if name not in found]:
-        raise TaskError(f"{path}: expected the arrays {', '.join(ARRAYS)}; it lacks {', '.join(missing)}")
+        raise TaskError(f"{path}: expected the arrays {', '.join(ARRAYS)}; {', '.join(missing)} missing")
     count = found["rewards"].size
     size = (task.observation_size,)
     widths = {"states": size, "next_states": size, "actions": (task.action_size,)}
@@ -49,7 +49,7 @@ def _read(path: str | Path, task: Task) -> list[Episode]:
         raise TaskError(f"{path}: expected transitions, got none")
     beyond = float(np.abs(found["actions"]).max())
     if beyond > 1 + 1e-6:
-        raise TaskError(f"{path}: actions: expected numbers in [-1, 1], got {beyond:.4g}; divide by the motors' range")
+        raise TaskError(f"{path}: actions: expected numbers in [-1, 1], got {beyond:.4g}; divide by their range")
     return _episodes(found)
 
 

@@ -44,14 +44,14 @@ def get_task(name: str, env_kwargs: Iterable[str] | Mapping[str, Any] = (), impo
     """
     for module in imports:
         import_module(module)
-    given = canonical(env_kwargs)
+    arguments = canonical(env_kwargs)
     by_lower = {known.lower(): task for known, task in _TASKS.items()}
     if name.lower() in by_lower:
-        require_no_kwargs(name, given)
+        require_no_kwargs(name, arguments)
         return by_lower[name.lower()]
-    found = _with_formulas(name, given) if name in KNOWN else resolve(name, env_kwargs=given)
-    if found is not None:
-        return found
+    task = _with_formulas(name, arguments) if name in KNOWN else resolve(name, env_kwargs=arguments)
+    if task is not None:
+        return task
     original = {known.lower(): known for known in (*_TASKS, *KNOWN, *gymnasium.registry)}
     names = list(original)
     near = [original[n] for n in difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.4)]

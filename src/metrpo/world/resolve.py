@@ -1,4 +1,4 @@
-"""From what a user types to a task: a Gymnasium id, `module:name`, `path/to/file.py:name`, or a dm_control id."""
+"""Finds the task that a user names: a Gymnasium id, `module:name`, `path/to/file.py:name`, or a dm_control id."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ def task_of(
     unseen: tuple[int, ...] = (),
     description: str = "",
 ) -> Task:
-    """A task out of an environment: its Gymnasium id, or a function that makes it (`render_mode=...` may be passed).
+    """A task from an environment: its Gymnasium id, or a function that creates it (and takes `render_mode=...`).
 
     `reward(s, a, s')` [..., S], [..., A], [..., S] -> [...] and `terminated(s')` [..., S] -> [...] are formulas for
-    NumPy and JAX arrays, with actions in [-1, 1]; what is not given is learned from the data. With `terminated=None`
-    nothing but the clock ends an episode. The horizon is the environment's time limit unless `horizon` is given.
+    NumPy and JAX arrays, with actions in [-1, 1]; a formula that is missing is learned from the data. With
+    `terminated=None`, only the time limit ends an episode: `horizon`, or else the environment's.
 
-    Raises `TaskError` when the environment cannot be made, breaks its promise in its first step, or has no time limit.
+    Raises `TaskError` when the environment cannot be created, fails in its first step, or has no time limit.
     """
     called = name or (env if isinstance(env, str) else str(getattr(env, "__name__", type(env).__name__)))
     make = partial(_make, env, called, horizon)
@@ -57,8 +57,8 @@ def task_of(
         shows = interface.of_env(with_limit._env, called)
     if limit is None:
         raise TaskError(
-            f"{called}: expected an environment with a time limit, got none: register it with max_episode_steps, wrap "
-            "it in gymnasium.wrappers.TimeLimit, or give metrpo.task_of(..., horizon=...)"
+            f"{called}: expected an environment with a time limit, got none; register it with max_episode_steps, wrap "
+            "it in gymnasium.wrappers.TimeLimit, or call metrpo.task_of(..., horizon=...)"
         )
     return Task(called, called, len(state), actions, limit, reward, terminated, unseen, description, make, shows)
 
@@ -67,7 +67,7 @@ def _make(env: str | MakeEnv, name: str, horizon: int | None, **kwargs: Any) -> 
     try:
         made = gymnasium.make(env, disable_env_checker=True, **kwargs) if isinstance(env, str) else env(**kwargs)
     except Exception as error:
-        raise TaskError(f"{name}: cannot be made ({type(error).__name__}: {error})") from error
+        raise TaskError(f"{name}: cannot create the environment ({type(error).__name__}: {error})") from error
     if made is None:
         raise TaskError(f"{name}: expected a gymnasium.Env, got None: does the function lack a return?")
     if not isinstance(made, gymnasium.Env):
@@ -76,11 +76,11 @@ def _make(env: str | MakeEnv, name: str, horizon: int | None, **kwargs: Any) -> 
 
 
 _PLACES: dict[tuple[str, tuple[str, ...]], Task] = {}
-"""What a name stands for in this process, where that is not what it says, by the keyword arguments that go with it."""
+"""The tasks that names stand for in this process (`place`), by name and keyword arguments."""
 
 
 def place(name: str, task: Task, env_kwargs: tuple[str, ...] = ()) -> Task:
-    """From here on `name`, with these keyword arguments, stands for `task`, which is returned under that name."""
+    """Lets `name`, with these keyword arguments, stand for `task` from now on; returns the task under that name."""
     _PLACES[name, env_kwargs] = dataclasses.replace(task, name=name)
     return _PLACES[name, env_kwargs]
 
@@ -172,24 +172,26 @@ def resolved(name: str, where: str, folder: Path | None, env_kwargs: tuple[str, 
     if value is None and attribute in gymnasium.registry:
         return task_of(with_kwargs(attribute, env_kwargs), name=name)
     if value is None:
-        raise TaskError(f"{name}: {module} has no {attribute!r}, nor registers it; define it there, or name another")
+        raise TaskError(
+            f"{name}: {module} neither defines nor registers {attribute!r}; define it there, or name another"
+        )
     if isinstance(value, Task):
         require_no_kwargs(name, env_kwargs)
         return dataclasses.replace(value, name=name)
     if callable(value):
         return task_of(with_kwargs(value, env_kwargs), name=name)
-    raise TaskError(f"{name}: expected a metrpo.Task or a function that makes an environment, got {value!r}")
+    raise TaskError(f"{name}: expected a metrpo.Task or a function that creates an environment, got {value!r}")
 
 
 def with_kwargs(env: str | MakeEnv, env_kwargs: tuple[str, ...]) -> str | MakeEnv:
     """An id, or a function that makes an environment, with keyword arguments; those of a call win."""
-    given = keywords(env_kwargs)
-    if not given:
+    kwargs = keywords(env_kwargs)
+    if not kwargs:
         return env
     return (
-        partial(gymnasium.make, env, **{"disable_env_checker": True, **given})
+        partial(gymnasium.make, env, **{"disable_env_checker": True, **kwargs})
         if isinstance(env, str)
-        else partial(env, **given)
+        else partial(env, **kwargs)
     )
 
 
@@ -197,8 +199,8 @@ def require_no_kwargs(name: str, env_kwargs: tuple[str, ...]) -> None:
     """Raises `TaskError` where keyword arguments are given to what is made already."""
     if env_kwargs:
         raise TaskError(
-            f"{name}: expected no env_kwargs, got {', '.join(env_kwargs)}: its environment is made already; "
-            "leave them out, or name a function that takes them and makes an environment"
+            f"{name}: expected no env_kwargs, got {', '.join(env_kwargs)}: its environment exists already; "
+            "leave them out, or name a function that takes them and creates an environment"
         )
 
 

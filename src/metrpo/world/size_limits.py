@@ -24,8 +24,7 @@ def require_size(name: str, size: int, most: str = "") -> None:
         raise TaskError(
             f"{name}: expected observations of at most {MOST_NUMBERS:,} numbers, got {size:,}{most and f', {most}'}: a "
             f"full dataset of {kept:,} transitions would take {kept * size * 8 / 2**30:,.0f} GiB; pictures cannot be "
-            "learned here: "
-            "give positions and velocities instead, or features that a network of yours makes of the picture (a "
+            "learned here: observe positions and velocities instead, or features that your own network extracts (in a "
             "gymnasium.ObservationWrapper)"
         )
 
@@ -35,6 +34,6 @@ def require_horizon(name: str, horizon: int) -> None:
     if not 1 <= horizon <= LONGEST:
         raise TaskError(
             f"{name}: expected episodes of 1 to {LONGEST:,} steps, got a time limit of {horizon:,}; cut them with "
-            "metrpo.task_of(..., horizon=1000), or with gymnasium.wrappers.TimeLimit(env, 1000): that is no end of the "
-            "task to the models"
+            "metrpo.task_of(..., horizon=1000), or with gymnasium.wrappers.TimeLimit(env, 1000); for the models, "
+            "that does not end the task"
         )

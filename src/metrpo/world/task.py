@@ -107,6 +107,6 @@ class Task:
         """Raises `TaskError` when there is no environment to step."""
         if not self.playable:
             raise TaskError(
-                f"{self.name}: expected an environment, got none: its episodes come from another program "
+                f"{self.name}: expected an environment, got none: your own program plays its episodes "
                 "(metrpo.append_episode, or metrpo collect DIR --data FILE) and metrpo improve DIR learns from them"
             )
