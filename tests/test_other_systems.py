@@ -37,4 +37,4 @@ def test_a_policy_is_used_where_there_is_no_unix(tmp_path):
     ran = subprocess.run(code, cwd=tmp_path, capture_output=True, text=True)
     assert (ran.returncode, ran.stdout.splitlines()[-1]) == (0, "all"), ran.stderr
     assert "(1,)" in ran.stdout
-    assert "has no file locks of Unix" in ran.stderr
+    assert "has no Unix file locks" in ran.stderr

@@ -54,7 +54,7 @@ def test_the_zoo_is_evaluated_rendered_and_exported(tmp_path, monkeypatch, capsy
     found = json.loads(capsys.readouterr().out)
     assert found["mean"] > 0.5 * zoo.card("Snake")["return"], "it swims"
     assert main.main(["export", "zoo:Snake"]) == 2
-    assert "zoo:Snake: expected where to write it" in capsys.readouterr().err
+    assert "zoo:Snake: expected --out" in capsys.readouterr().err
     assert main.main(["export", "zoo:Snake", "--out", "snake.py"]) == 0
     seen = []
     monkeypatch.setattr("metrpo.evaluation.record", lambda make, policy, out, seed: seen.append(out) or out)

@@ -574,7 +574,7 @@ def test_a_gpu_that_is_not_there_is_one_message(platforms, devices):
     environment = {"JAX_PLATFORMS": platforms, "XLA_FLAGS": flags}
     ran = program("train", "Swimmer", "--device", "gpu", "--run-dir", "a", **environment)
     assert ran.returncode == 2
-    assert "metrpo: device: JAX finds no GPU here, only the CPU; install JAX for it (pip install " in ran.stderr
+    assert "metrpo: device: expected a GPU, JAX finds only the CPU; install JAX for it (pip install " in ran.stderr
     assert "(pip install 'jax[cuda13]', or 'jax[cuda12]'" in ran.stderr
     assert ran.stderr.count("\n") == 1
     assert not Path("a").exists()

@@ -57,7 +57,7 @@ def one_failure(uninterrupted, run_dir, fault, n, caplog):
         assert os.strerror(fault) in text, where
         assert "choose a writable" in text or "choose another" in text, where
     # What did not fail has told what it goes on without, or the rest of the run needed nothing more from the disk.
-    assert failed or "training goes on" in caplog.text or disk.count - n < 10, where
+    assert failed or "training continues" in caplog.text or disk.count - n < 10, where
     while command is not None:
         command()
         command = next(given, None)

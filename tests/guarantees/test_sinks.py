@@ -78,7 +78,7 @@ def test_what_breaks_costs_only_itself(owner, name, what, costs, breaks, tmp_pat
         train(CONFIG, tmp_path)
     assert time.monotonic() - before < 20
     why = {raises: "RuntimeError: no fonts", hangs: "TimeoutError: not finished within 0.2 s"}[breaks]
-    assert [r.getMessage() for r in caplog.records] == [f"no {what} from here on ({why}); training goes on"]
+    assert [r.getMessage() for r in caplog.records] == [f"no {what} any more ({why}); training continues"]
     assert differing(result(tmp_path), expected) == costs
     train(CONFIG, tmp_path)  # once it works again
     assert differing(result(tmp_path), expected) == []

@@ -95,7 +95,7 @@ def test_lists_may_be_given_at_once_or_one_by_one(lines):
 
 
 def test_a_setting_is_given_once():
-    with pytest.raises(ConfigError, match=r"set: expected each once, got trpo.max_kl, trpo.max_kl"):
+    with pytest.raises(ConfigError, match=r"set: expected each name once, got trpo.max_kl, trpo.max_kl"):
         told("--set trpo.max_kl=0.1 --set trpo.max_kl=0.2")
 
 
@@ -132,8 +132,8 @@ def test_systems_may_have_budgets_of_their_own(tmp_path):
         ("--budget me-trpo", "budget: expected SYSTEM=REAL_STEPS such as trpo=300000, got 'me-trpo'"),
         ("--budget me-trpo=1e6", "budget: expected SYSTEM=REAL_STEPS"),
         ("--budget me-trpo=-1", "real_steps: expected at least 0"),
-        ("--budget me-trpo=1 me-trpo=2", "budget: expected each once, got me-trpo, me-trpo"),
-        ("--budget me-trpo=1 --set real_steps=2", "set: real_steps: expected the budget in one place"),
+        ("--budget me-trpo=1 me-trpo=2", "budget: expected each name once, got me-trpo, me-trpo"),
+        ("--budget me-trpo=1 --set real_steps=2", "set: real_steps: expected the budget once"),
     ):
         with pytest.raises(ConfigError, match=message):
             told(words).runs()

@@ -177,7 +177,7 @@ def test_three_differences_are_named_and_the_others_counted(tmp_path, wrong, mor
 def test_a_task_of_another_size_is_no_other_version(tmp_path):
     path = tmp_path / "a.npz"
     save_state(path, {"x": np.zeros((2, 3), np.float32), "y": jnp.zeros(4)}, {})
-    with pytest.raises(RunDirectoryError, match="task's observations or actions have another size now") as error:
+    with pytest.raises(RunDirectoryError, match="size of the task's observations or actions has changed") as error:
         load_state(path, {"x": np.zeros((2, 5), np.float32), "y": jnp.zeros(4)})
     assert "['x'] of shape [2, 3] instead of ['n', 5]" in str(error.value)
     assert not re.search("use that version|expected 2 arrays", str(error.value))

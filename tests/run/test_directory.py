@@ -353,7 +353,7 @@ def cut(path: Path) -> None:
         (
             "checkpoints",
             lambda p: [f.unlink() for f in p.iterdir()],
-            "has lost its checkpoints: expected that of iteration 2, the last in metrics.csv",
+            "has lost its checkpoints: expected one of iteration 2, the last in metrics.csv",
         ),
     ],
 )
@@ -380,7 +380,7 @@ def test_a_damaged_checkpoint_costs_its_iteration_only(tmp_path, caplog):
 
 def test_a_directory_with_other_things_is_refused(tmp_path):
     (tmp_path / "thesis.txt").write_text("years of work")
-    with pytest.raises(RunDirectoryError, match=r"is no run directory: expected it empty .* got thesis\.txt"):
+    with pytest.raises(RunDirectoryError, match=r"is no run directory: expected an empty one .* got thesis\.txt"):
         RunDirectory(tmp_path, CONFIG)
     assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
 
@@ -426,7 +426,7 @@ def test_a_broken_picture_costs_one_warning(tmp_path, monkeypatch, caplog):
     with caplog.at_level(logging.WARNING, "metrpo"):
         assert train(tmp_path, until=3) == [1, 2, 3]
     assert [r.getMessage() for r in caplog.records] == [
-        "no learning curve from here on (RuntimeError: no fonts); training goes on"
+        "no learning curve any more (RuntimeError: no fonts); training continues"
     ]
 
 

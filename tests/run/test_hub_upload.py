@@ -101,10 +101,10 @@ def test_any_name_of_a_task_is_a_text_of_the_card(tmp_path):
 def test_what_is_no_finished_run_is_refused(tmp_path, capsys):
     run_dir = a_finished_run(tmp_path / "run", dataclasses.replace(CONFIG, iterations=3))
     for place, said in (
-        (run_dir, "expected a finished run, got one of 2 iterations whose budget is not spent; go on with"),
-        (tmp_path, "expected the directory of a finished run, got none with policy.npz"),
-        (tmp_path / "none", "expected the directory of a finished run, got none with policy.npz"),
-        ("zoo:Snake", "expected the directory of a run of yours, got a policy's name"),
+        (run_dir, "expected a finished run, got one of 2 iterations whose budget is not spent; resume it with"),
+        (tmp_path, "expected the directory of a finished run, got one without policy.npz"),
+        (tmp_path / "none", "expected the directory of a finished run, got one without policy.npz"),
+        ("zoo:Snake", "expected the directory of your own run, got a policy's name"),
     ):
         assert main.main(["push", str(place), "--dry-run"]) == 2
         assert said in capsys.readouterr().err
@@ -159,7 +159,7 @@ def test_nobody_and_a_stranger_are_told_what_to_do(stub, tmp_path):
     run_dir = a_finished_run(tmp_path / "run")
     ran = metrpo_with(stub, tmp_path / "home", "push", run_dir, "--repo", "me/no", token=None)
     assert (ran.returncode, ran.stderr.count("\n")) == (2, 1)
-    assert "found no token; run: hf auth login, or set HF_TOKEN" in ran.stderr
+    assert "got no token; run: hf auth login, or set HF_TOKEN" in ran.stderr
     ran = metrpo_with(stub, tmp_path / "home", "push", run_dir, "--repo", "me/no", token="hf_wrong")
     assert (ran.returncode, ran.stderr.count("\n")) == (2, 1), ran.stderr
     assert "me/no: expected the hub to take it;" in ran.stderr
@@ -192,8 +192,8 @@ def test_a_policy_of_the_hub_runs_no_code_that_its_author_names(tmp_path, monkey
     monkeypatch.setattr("metrpo.evaluation.record", lambda make, policy, out, seed: recorded.append(str(out)) or out)
     render("hub:me/x", task="Swimmer")
     assert recorded == ["x.mp4"], "nothing is written into the cache"
-    with pytest.raises(MetrpoError, match="hub:me/x: expected where to write it"):
+    with pytest.raises(MetrpoError, match="hub:me/x: expected --out"):
         metrpo.run.policy_export.export("hub:me/x")
     assert not (tmp_path / "ran").exists()
-    with pytest.raises(RunDirectoryError, match="expected the directory of a run of yours"):
+    with pytest.raises(RunDirectoryError, match="expected the directory of your own run"):
         parcel("hub:me/x", None)

@@ -15,12 +15,12 @@ from metrpo.world.registry import tasks
 
 PLAIN = dataclasses.replace(preset("Swimmer"), task="Probe")
 HUGE = [
-    ("ensemble", "members", 100_000_000, r"the models' weights and their optimizer alone take [\d,.]+ GiB"),
-    ("ensemble", "hidden", (10**6, 10**6), "one model's weights and their optimizer alone take 14,901"),
+    ("ensemble", "members", 100_000_000, r"the models' weights and optimizer states alone take [\d,.]+ GiB"),
+    ("ensemble", "hidden", (10**6, 10**6), "one model's weights and optimizer state alone take 14,901"),
     ("imagine", "steps", 10**12, "imagined transitions alone take 22,351.7 GiB"),
     ("imagine", "steps", 10**30, "imagined transitions alone take"),
-    ("fit", "batch_size", 10**12, "the batches of a training step alone take"),
-    ("validate", "starts", 10**12, "the states from which models validate alone take"),
+    ("fit", "batch_size", 10**12, "the minibatches of a step alone take"),
+    ("validate", "starts", 10**12, "the start states of validation alone take"),
     ("policy", "hidden", (10**6, 10**6), "the policy's weights alone take"),
 ]
 
@@ -33,7 +33,7 @@ def with_setting(room, name, value):
 def test_what_cannot_fit_is_one_sentence_with_its_size(room, name, value, message, tmp_path):
     config = with_setting(room, name, value)
     with probe.registered():
-        with pytest.raises(ConfigError, match=rf"^{room}\.{name}: expected what fits into .* GiB .*{message}"):
+        with pytest.raises(ConfigError, match=rf"^{room}\.{name}: expected a value that fits into .* GiB .*{message}"):
             init(config)
         with pytest.raises(ConfigError, match=message):
             begin(config, tmp_path / "run")

@@ -146,7 +146,7 @@ def test_a_run_is_evaluated_elsewhere_and_after_its_file_moved(tmp_path, monkeyp
     code, said = evaluated(capsys, "run")
     assert code == 2
     assert "expected a Python file at " in said
-    assert "found none; if it has moved, say where: --task path/to/file.py:name" in said
+    assert "found none; if it has moved, give its new place: --task path/to/file.py:name" in said
     assert evaluated(capsys, "run", "--task", "moved/mine.py:make") == (0, "moved/mine.py:make")
 
 
@@ -175,7 +175,7 @@ def test_a_modules_run_is_evaluated_elsewhere_and_after_it_moved(tmp_path, monke
     code, said = evaluated(capsys, "run")
     assert code == 2
     assert "expected a module parts.mine in " in said
-    assert "if it has moved, say where: --task path/to/file.py:name" in said
+    assert "if it has moved, give its new place: --task path/to/file.py:name" in said
 
 
 def test_the_folder_of_an_installed_module_is_not_kept(monkeypatch):
@@ -268,7 +268,7 @@ def test_init_names_only_what_can_add_episodes_to_its_task(monkeypatch, capsys):
 
 
 def test_only_what_lies_in_a_file_or_module_can_have_moved():
-    with pytest.raises(ConfigError, match="task: expected it for a run whose task lies in a file or module, got"):
+    with pytest.raises(ConfigError, match="task: expected a run whose task lies in a file or module, got"):
         moved(Config("Swimmer"), "there/mine.py:make")
 
 

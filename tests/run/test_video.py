@@ -103,11 +103,11 @@ def test_other_failures_are_not_blamed_on_opengl(tmp_path, monkeypatch):
         raise RuntimeError("no paint")
 
     monkeypatch.setattr(Pictures, "render", broken)
-    with pytest.raises(VideoError, match=r"render\(\) failed \(RuntimeError: no paint\): mend") as error:
+    with pytest.raises(VideoError, match=r"render\(\) failed \(RuntimeError: no paint\): repair") as error:
         record(Pictures, zero, tmp_path / "v.gif")
     assert "osmesa" not in str(error.value)
     monkeypatch.setattr(Pictures, "render", gymnasium.Env.render)
-    with pytest.raises(VideoError, match=r"has no render\(\): there is nothing to see; do without: --no-video"):
+    with pytest.raises(VideoError, match=r"has no render\(\), so there is nothing to see; skip the video: --no-video"):
         record(Pictures, zero, tmp_path / "v.gif")
 
 
@@ -130,7 +130,9 @@ def test_with_pygame_the_pendulum_is_seen(tmp_path):
 
 
 def test_an_environment_without_pictures_is_named(tmp_path, monkeypatch):
-    with pytest.raises(VideoError, match=r"cannot be made with render_mode.*TypeError.*take render_mode.*--no-video"):
+    with pytest.raises(
+        VideoError, match=r"cannot create the environment with render_mode.*TypeError.*take render_mode.*--no-video"
+    ):
         record(lambda: None, zero, tmp_path / "v.gif")
     monkeypatch.setattr(Pictures, "render", lambda self: None)
     with pytest.raises(VideoError, match=r"expected a picture \[height, width, 3\], got NoneType.*--no-video"):

@@ -1,4 +1,4 @@
-"""Runs what a figure of the paper or a grid needs and is missing, each run a `metrpo train` of its own."""
+"""Runs the missing runs of a figure of the paper or of a grid, each as its own `metrpo train`."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ BACKENDS: dict[Backend, Callable[[list[RunSpec], Path, Means, Tell], list[RunSpe
     "local": run_locally,
     "ray": run_on_ray,
 }
-"""Name -> what runs all the given runs under a folder, tells of their ends, and returns those that failed."""
+"""Name -> function that runs all runs under a folder, reports how they end, and returns those that failed."""
 
 
 def differences(run: RunSpec, out: Path) -> dict[str, tuple[object, object]]:
-    """Settings with which the run on disk was made, and others that it would have today."""
+    """Settings in which the run on disk differs from `run`."""
     path = out / run.name / "config.json"
     if not path.exists():
         return {}
@@ -29,10 +29,10 @@ def differences(run: RunSpec, out: Path) -> dict[str, tuple[object, object]]:
 
 
 def dispatch(runs: list[RunSpec], out: Path, means: Means, tell: Tell) -> list[RunSpec]:
-    """Runs all that is not finished, several at a time, and returns those that failed, which stop no others.
+    """Runs all unfinished runs, several at a time, and returns those that failed; these do not stop the others.
 
-    Started anew it goes on where it was stopped. Ctrl-C or SIGTERM stops the runs too, each with its iteration
-    saved; once more stops them at once.
+    Started again, it resumes where it was stopped. Ctrl-C or SIGTERM stops the runs too, each with its iteration
+    saved; a second one stops them at once.
 
     Raises `MetrpoError` when `out` cannot be written or the backend is not there.
     """

@@ -25,7 +25,7 @@ _LONGEST, _KEPT = 255, 180
 
 @dataclass(frozen=True)
 class Grid:
-    """What is combined with what."""
+    """The tasks, systems, seeds and settings to combine."""
 
     tasks: tuple[str, ...]
     systems: tuple[str, ...] = ("me-trpo",)
@@ -35,15 +35,14 @@ class Grid:
     """Dotted setting -> its values."""
     iterations: int | None = None
     real_steps: int | None = None
-    """The budget of every run, one of the two; default: the preset's. It names no folder, for it may be raised."""
+    """The budget of every run, one of the two; default: the preset's. Folder names leave it out: it may be raised."""
     budgets: Mapping[str, int] = field(default_factory=dict)
-    """System -> its runs' real steps, instead of that budget: a method without models needs more than one with them."""
+    """System -> real steps of its runs, instead of that budget: a method without models needs more of them."""
 
     def runs(self) -> list[RunSpec]:
         """Every run of the grid, first seeds first.
 
-        Raises `ConfigError` or `TaskError` for what cannot be run, before anything is: an unknown setting or task, an
-        impossible value.
+        Raises `ConfigError` or `TaskError`, before anything runs, for unknown settings and tasks and impossible values.
         """
         names, columns = list(self.settings), [list(values) for values in self.settings.values()]
         if not self.tasks or not self.systems or not self.seeds or not all(columns):
@@ -52,24 +51,22 @@ class Grid:
             raise ConfigError(f"sweep: systems: expected some of {', '.join(get_args(System))}, got {unknown[0]}")
         budgets = self._budgets()
         if twice := [name for name in names if any(budgets.values()) and name in BUDGET_FIELDS]:
-            raise ConfigError(
-                f"set: {twice[0]}: expected the budget in one place, got it as an option too; leave one out"
-            )
-        found = []
-        for seed, given, system, values in itertools.product(
+            raise ConfigError(f"set: {twice[0]}: expected the budget once, got it as an option too; leave one out")
+        runs = []
+        for seed, task_name, system, values in itertools.product(
             self.seeds, self.tasks, self.systems, itertools.product(*columns)
         ):
             overrides = tuple((name, _hashable(value)) for name, value in zip(names, values, strict=True))
-            made = dict(overrides)
-            task = get_task(given, made.get("env_kwargs", ()), made.get("imports", ())).name
+            settings = dict(overrides)
+            task = get_task(task_name, settings.get("env_kwargs", ()), settings.get("imports", ())).name
             variant = variant_name(system, overrides)
-            found.append(RunSpec(task, system, seed, budgets[system] + overrides, self.preset, variant))
-        for run in found:
+            runs.append(RunSpec(task, system, seed, budgets[system] + overrides, self.preset, variant))
+        for run in runs:
             _ = run.config
-        return list(dict.fromkeys(found))
+        return list(dict.fromkeys(runs))
 
     def _budgets(self) -> dict[str, tuple[tuple[str, Any], ...]]:
-        """By system what its runs' settings say of the budget."""
+        """System -> the settings of its runs' budget."""
         usual = tuple((n, v) for n in BUDGET_FIELDS if (v := getattr(self, n)) is not None)
         if len(usual) > 1:
             raise ConfigError("sweep: expected iterations or real_steps, got both; leave one out")
@@ -83,7 +80,7 @@ def from_file(path: Path) -> Grid:
     """The grid in a TOML file: tasks, systems, seeds (a list or "0:5"), preset, budget, and tables [budget] of single
     systems' real steps and [set] of settings.
 
-    Raises `ConfigError` when it cannot be read or says something else.
+    Raises `ConfigError` when it cannot be read or holds something else.
     """
     try:
         spec = tomllib.loads(path.read_text("utf-8"))
@@ -116,23 +113,23 @@ def budget_of(text: str) -> tuple[str, int]:
 
 
 def require_once(option: str, names: Sequence[str]) -> None:
-    """Raises `ConfigError` when an option is to set something twice."""
+    """Raises `ConfigError` when an option names something twice."""
     if len(set(names)) < len(names):
-        raise ConfigError(f"{option}: expected each once, got {', '.join(names)}")
+        raise ConfigError(f"{option}: expected each name once, got {', '.join(names)}")
 
 
 def seeds_of(text: str) -> tuple[int, ...]:
     """Seeds as typed: "3" is 3, "0:5" is 0 to 4, "0,2,7" these, each once. Raises `ConfigError` for anything else."""
-    found: list[int] = []
+    seeds: list[int] = []
     for part in text.split(","):
         first, colon, end = part.partition(":")
         try:
-            found += range(int(first or 0), int(end)) if colon else [int(part)]
+            seeds += range(int(first or 0), int(end)) if colon else [int(part)]
         except ValueError:
-            found.append(-1)
-    if not found or min(found) < 0:
+            seeds.append(-1)
+    if not seeds or min(seeds) < 0:
         raise ConfigError(f"seeds: expected a number, a range such as 0:5 or a list such as 0,2,7, got {text!r}")
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(seeds))
 
 
 def values_of(text: str) -> tuple[str, list[Any]]:
@@ -158,11 +155,11 @@ def _plain(word: str) -> Any:
 
 
 def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """TOML's ensemble.members is a table in a table."""
-    found: dict[str, Any] = {}
+    """The table with dotted names: in TOML, ensemble.members is a table in a table."""
+    dotted: dict[str, Any] = {}
     for name, value in table.items():
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
-    return found
+        dotted |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return dotted
 
 
 def _hashable(value: Any) -> Any:
@@ -170,7 +167,7 @@ def _hashable(value: Any) -> Any:
 
 
 def variant_name(system: str, overrides: tuple[tuple[str, Any], ...]) -> str:
-    """The folder of a combination, in words: "me-trpo,ensemble.members=5"; a hash stands for the end of a long one."""
+    """The folder of a combination, such as "me-trpo,ensemble.members=5"; a hash replaces the end of a long name."""
 
     def word(value: Any) -> str:
         return "x".join(map(str, value)) if isinstance(value, tuple) else str(value)

@@ -1,4 +1,4 @@
-"""Many runs on this machine: processes of their own, among which its cores are divided."""
+"""Many runs on this machine: one process each, among which the cores are divided."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from metrpo.run import machine
 _POLL = 0.5
 """Seconds between two looks at the processes."""
 _REPORT = 60.0
-"""Seconds between two lines on what goes on."""
+"""Seconds between two progress reports."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class _Child:
 
 
 def run_locally(runs: list[RunSpec], out: Path, means: Means, tell: Tell) -> list[RunSpec]:
-    """Runs all, so many at a time on cores of their own, and returns those that failed (see `reproduce`)."""
+    """Runs all, several at a time on their own cores, and returns those that failed (see `reproduce`)."""
     jobs = means.jobs or max(1, machine.cores() // (means.cpus or 1))
     tell(f"{jobs} at a time on this machine")
     machine.divide_gpu(jobs)
@@ -50,8 +50,8 @@ def run_locally(runs: list[RunSpec], out: Path, means: Means, tell: Tell) -> lis
             for child in [c for c in children if c.process.poll() is not None]:
                 children.remove(child)
                 free.append(child.cores)
-                done = len(runs) - len(waiting) - len(children)
-                if _finish(child, out, f"{done}/{len(runs)}", tell):
+                ended = len(runs) - len(waiting) - len(children)
+                if _finish(child, out, f"{ended}/{len(runs)}", tell):
                     failed.append(child.run)
             if time.monotonic() - reported > _REPORT:
                 reported = time.monotonic()
@@ -63,9 +63,9 @@ def run_locally(runs: list[RunSpec], out: Path, means: Means, tell: Tell) -> lis
 
 
 def _stop(children: list[_Child], tell: Tell) -> None:
-    """Ends the runs: asked once, each finishes its iteration; when this is interrupted, it asks them once more."""
+    """Stops the runs: each finishes its iteration. When interrupted, stops them at once."""
     if children:
-        tell(f"stopping {counted(len(children), 'run')} at the end of an iteration; once more stops them at once")
+        tell(f"stopping {counted(len(children), 'run')} at the end of an iteration; press again to stop at once")
     try:
         _ask_to_stop(children)
     except BaseException:
@@ -81,14 +81,14 @@ def _ask_to_stop(children: list[_Child]) -> None:
 
 
 def start(run: RunSpec, out: Path, cores: tuple[int, ...]) -> subprocess.Popen[bytes]:
-    """The run as a `metrpo train` of its own on these cores. Raises `MetrpoError` when `out` cannot be written."""
+    """Starts the run as its own `metrpo train` on these cores. Raises `MetrpoError` when `out` cannot be written."""
     directory = out / run.name
     try:
         directory.mkdir(parents=True, exist_ok=True)
         log = os.open(log_of(run, out), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     except OSError as error:
         raise MetrpoError(f"cannot write {directory}: {error.strerror or error}; choose another --out") from error
-    # A session of its own: Ctrl-C is for this process, which then ends its children one by one.
+    # Its own session: Ctrl-C goes to this process only, which then ends its children one by one.
     process = subprocess.Popen(_command(run, directory), stdout=log, stderr=subprocess.STDOUT, start_new_session=True)
     os.close(log)  # the process has its own
     if cores:
@@ -102,7 +102,7 @@ def _command(run: RunSpec, directory: Path) -> list[str]:
 
 
 def _finish(child: _Child, out: Path, count: str, tell: Tell) -> bool:
-    """Tells how a run ended; whether it failed."""
+    """Reports how a run ended; returns whether it failed."""
     rows, seconds = rows_of(child.run, out), time.monotonic() - child.began
     if child.process.returncode == 0 and has_spent(child.run, rows):
         tell_success(child.run, count, rows, seconds, tell)
@@ -117,6 +117,6 @@ def shares_of_cores(jobs: int, each: int | None = None) -> list[tuple[int, ...]]
     """The cores of this process, shared among the jobs; empty shares where they cannot be assigned."""
     if not hasattr(os, "sched_setaffinity"):
         return [()] * jobs
-    mine = sorted(os.sched_getaffinity(0))
-    each = min(each or max(1, len(mine) // jobs), len(mine))
-    return [tuple(mine[(i * each + n) % len(mine)] for n in range(each)) for i in range(jobs)]
+    own = sorted(os.sched_getaffinity(0))
+    each = min(each or max(1, len(own) // jobs), len(own))
+    return [tuple(own[(i * each + n) % len(own)] for n in range(each)) for i in range(jobs)]

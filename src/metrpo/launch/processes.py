@@ -1,4 +1,4 @@
-"""Runs in other processes: started here, or found still going after the process that started them was killed."""
+"""Runs in other processes: started here, or still running after the process that started them was killed."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from metrpo.launch.status import is_finished
 
 Cores = tuple[int, ...]
 _POLL = 0.5
-"""Seconds between two looks at a run that is waited for."""
+"""Seconds between two looks at a run."""
 
 
 class Worker(Protocol):
-    """A run that goes on in another process; `subprocess.Popen` is one."""
+    """A run in another process; `subprocess.Popen` is one."""
 
     def poll(self) -> int | None:
         """Its exit code once it has ended."""
 
     def terminate(self) -> None:
-        """Asks it to stop after its iteration; once more: at once. Nothing where it has ended."""
+        """Asks it to stop after its iteration; a second call, at once. Does nothing once it has ended."""
 
     def wait(self) -> int:
         """Waits for its end and returns its exit code."""
@@ -37,12 +37,12 @@ Begin = Callable[[RunSpec, Path, Cores], Worker]
 
 
 def begin(run: RunSpec, out: Path, cores: Cores) -> Worker:
-    """The run as a `metrpo train` of its own on these cores, or the one that is still at it."""
+    """Starts the run as its own `metrpo train` on these cores, unless it is still running."""
     return Orphan(run, out, cores) if is_running(out / run.name) else start(run, out, cores)
 
 
 class Orphan:
-    """A run whose `metrpo tune` was killed, while it went on by itself: watched, and taken over once it ends."""
+    """A run that outlived its `metrpo tune`, which was killed: watched, and taken over once it ends."""
 
     def __init__(self, run: RunSpec, out: Path, cores: Cores) -> None:
         self._run, self._out, self._cores = run, out, cores
@@ -60,7 +60,7 @@ class Orphan:
         return self._process.poll()
 
     def terminate(self) -> None:
-        """Asks whoever holds the run's lock."""
+        """Asks the process that holds the run's lock."""
         self._asked = True
         if self._process is not None:
             self._process.terminate()

@@ -1,6 +1,6 @@
-"""`python -m metrpo.launch.tied PID ...`: `metrpo ...` that is killed when its parent PID ends, however that ends.
+"""`python -m metrpo.launch.tied PID ...`: runs `metrpo ...`, and is killed when its parent PID ends in any way.
 
-A worker that is killed could not end its run otherwise, which would go on without anybody's knowledge.
+Otherwise, a killed worker would leave its run behind, unknown to anybody.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _PR_SET_PDEATHSIG = 1
 def tie(parent: int) -> None:
     """Lets this process be killed with its parent; raises `SystemExit` when that has ended already.
 
-    Where there is no such thing (it is Linux's) nothing happens: whoever goes on with the run waits for this process.
+    On other systems than Linux it does nothing: the process that resumes the run waits for this one.
     """
     if not sys.platform.startswith("linux"):
         return

@@ -62,7 +62,7 @@ def _advice(wrong: list[str], resized: bool, writer: Any) -> str:
     said = f"it {'; it '.join(wrong[:3])}{more}"
     if resized:
         return (
-            f"{said}. The task's observations or actions have another size now: give it the old ones, "
+            f"{said}. The size of the task's observations or actions has changed: restore it, "
             "or choose another directory (--run-dir)"
         )
     if writer == metrpo_version():

@@ -57,11 +57,11 @@ if TYPE_CHECKING:  # importing a run directory imports no environment
 _log = logging.getLogger("metrpo")
 _KEPT = 2
 _PATIENCE = 120.0
-"""Seconds for what is derived from a checkpoint; the first curve ever drawn on a machine looks for its fonts."""
+"""Seconds to write a file derived from a checkpoint; the first curve ever drawn on a machine looks for fonts."""
 
 
 class Saved(Protocol):
-    """What a run directory must know of a training state: a pytree with these fields."""
+    """A training state, as a run directory sees it: a pytree with these fields."""
 
     @property
     def iteration(self) -> int:
@@ -80,7 +80,7 @@ State = TypeVar("State", bound=Saved)
 
 
 class RunDirectory:
-    """One run on disk, held by this process until `close` (or the end of a `with` block).
+    """One run on disk, locked by this process until `close` (or the end of a `with` block).
 
     Opening creates the directory, or checks that it holds a run of this version with the same settings; only the budget
     (`config.BUDGET_FIELDS`) may have changed. Use: `load` once, then `save` after every outer iteration.
@@ -113,14 +113,14 @@ class RunDirectory:
         self.close()
 
     def close(self) -> None:
-        """Lets go of the directory."""
+        """Unlocks the directory."""
         self._lock.close()
 
     def load(self, template: State) -> State | None:
         """The state of the newest checkpoint, in `template`'s structure; None in a fresh directory.
 
-        A damaged checkpoint costs its iteration only: the one before it takes its place, with a warning, and the real
-        episodes of that iteration are still there.
+        A damaged checkpoint loses only its iteration: the one before takes its place, with a warning, and the real
+        episodes of the lost iteration are still there.
 
         Raises `RunDirectoryError` when no checkpoint is sound, or it is of another structure or version.
         """
@@ -142,7 +142,7 @@ class RunDirectory:
         return state
 
     def begin(self, state: Saved) -> None:
-        """Saves the state before the first iteration: for those who take the loop's steps one at a time.
+        """Saves the state before the first iteration, for callers who run the loop's steps one at a time.
 
         Raises `RunDirectoryError` when a file cannot be written.
         """
@@ -176,7 +176,7 @@ class RunDirectory:
         return self._checkpoints()[-1]
 
     def _load_newest(self, found: list[Path], template: State) -> tuple[State, dict[str, Any]]:
-        """The newest checkpoint that is as it was written; damaged ones are set aside."""
+        """The newest intact checkpoint; damaged ones are set aside."""
         damaged: list[tuple[Path, DamagedFile]] = []
         for path in reversed(found):
             try:
@@ -187,14 +187,14 @@ class RunDirectory:
                 continue
             require_same(_config(path, meta), self.config, f"{path}, unlike config.json,", self.path)
             for old, why in damaged:
-                _log.warning("%s; going on from %s, the damaged file is kept as %s.damaged", why, path.name, old.name)
+                _log.warning("%s; resuming from %s, the damaged file is kept as %s.damaged", why, path.name, old.name)
                 with writing(aside := old.with_name(f"{old.name}.damaged")):
                     old.rename(aside)
             return state, meta
         what = " and ".join(str(why) for _, why in damaged)
         raise DamagedFile(
             f"{what}. Nothing was changed. There is no earlier checkpoint: put the file back, or start anew in another "
-            "directory"
+            "directory (--run-dir)"
         )
 
     def _write_checkpoint(self, state: Saved, rows: list[Row], taken: int) -> None:
@@ -211,24 +211,24 @@ class RunDirectory:
         if metrics.exists():
             finished = len(read_metrics(metrics))
             raise RunDirectoryError(
-                f"{self.path} has lost its checkpoints: expected that of iteration {finished}, the last in "
+                f"{self.path} has lost its checkpoints: expected one of iteration {finished}, the last in "
                 f"{metrics.name}, got none; put the files back or choose another directory"
             )
 
     def _look_for_more(self, newest: Path) -> None:
-        # A row is written after its checkpoint; what cannot be read is written anew in any case.
+        # A row is written after its checkpoint. A file that cannot be read is written anew anyway.
         with contextlib.suppress(RunDirectoryError):
             finished = len(read_metrics(self.path / "metrics.csv"))
             if finished > _number(newest):
                 lost = f"iteration-{finished:05d}.npz"
-                _log.warning("%s has lost its checkpoint %s: going on from an earlier one", self.path, lost)
+                _log.warning("%s has lost its checkpoint %s; resuming from an earlier one", self.path, lost)
 
     def _write_config(self) -> None:
-        # The budget may be another one than last time.
+        # The budget may have changed since last time.
         atomic_write(self.path / "config.json", configs.to_json(self.config))
 
     def _publish(self, state: Saved) -> None:
-        # All of it at every start, too: nothing says whether a picture or an event file is damaged.
+        # Rewrite all of it at every start, too: no check tells whether a picture or an event file is damaged.
         for old in self._checkpoints()[:-_KEPT]:
             with contextlib.suppress(OSError):  # costs room only
                 old.unlink()
@@ -239,7 +239,7 @@ class RunDirectory:
         self._derive("TensorBoard events", self._write_events)
         if all(rows := [details(row) for row in self.rows]):
             atomic_write(self.path / "diagnostics.csv", to_csv(rows))
-        # Last: a run counts as finished, and is not begun again, by the rows in this file.
+        # Last: the rows in this file decide whether a run is finished.
         atomic_write(self.path / "metrics.csv", to_csv([overview(row) for row in self.rows]))
 
     def _write_policy(self, state: Saved) -> None:
@@ -260,18 +260,18 @@ class RunDirectory:
             self._events.add(self.rows[-1])
 
     def _derive(self, what: str, write: Callable[[], None]) -> None:
-        # A picture that cannot be drawn, or is never finished, must not cost hours of training.
+        # A picture that fails, or takes forever, must not cost hours of training.
         if what in self._failed:
             return
         try:
             _within(_PATIENCE, write)
         except Exception as error:
             self._failed.add(what)
-            _log.warning("no %s from here on (%s: %s); training goes on", what, type(error).__name__, error)
+            _log.warning("no %s any more (%s: %s); training continues", what, type(error).__name__, error)
 
 
 def _within(seconds: float, act: Callable[[], None]) -> None:
-    """Calls `act`; `TimeoutError` when it takes longer, and is left behind. It must touch nothing that others need."""
+    """Calls `act`; raises `TimeoutError` when it takes longer, and leaves it running. It must not touch shared data."""
     raised: list[BaseException] = []
 
     def attempt() -> None:
@@ -302,7 +302,7 @@ def _config(path: Path, meta: Mapping[str, Any]) -> Config:
 
 
 def _check(path: Path, state: Saved, meta: Mapping[str, Any]) -> None:
-    """Holds a checkpoint's name, state and record against each other, for files are renamed, and copied by hand.
+    """Checks that a checkpoint's name, state and record agree, for people rename and copy files by hand.
 
     Raises `DamagedFile` when it is another iteration's, `RunDirectoryError` when no run can have written it.
     """
@@ -316,7 +316,7 @@ def _check(path: Path, state: Saved, meta: Mapping[str, Any]) -> None:
         if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state)):
             raise ValueError("expected finite numbers, got some that are infinite or NaN")
     except ValueError as error:
-        raise RunDirectoryError(f"{path} holds no state to go on from: {error}; choose another directory") from None
+        raise RunDirectoryError(f"{path} holds no state to resume from: {error}; choose another directory") from None
 
 
 def stored_config(run_dir: str | Path) -> Config:

@@ -86,7 +86,7 @@ class EpisodeLog:
         self.read = max([self.taken, *(n + 1 for n in numbers)])
         if lost := self.read - self.taken - len(numbers):
             span = f"{self.taken:08d} and {self.read - 1:08d}"
-            _log.warning("%s: %d real episodes between %s are gone; going on without them", self.folder, lost, span)
+            _log.warning("%s: %d real episodes between %s are gone; continuing without them", self.folder, lost, span)
         return [episode for episode, proof in map(self._load, numbers) if not proof]
 
     def proofs(self) -> list[Episode]:
@@ -111,20 +111,20 @@ class EpisodeLog:
         states = episode.states if self.layout is None else self.layout.newest(episode.states)
         arrays = {**episode._asdict(), "states": states, "terminated": np.bool_(episode.terminated)}
         arrays = {name: np.asarray(array) for name, array in arrays.items()}
-        mine = self.folder / f"from-{self._writer}.npz"
+        temporary = self.folder / f"from-{self._writer}.npz"
         try:
             with writing(self._path(number)):
                 while True:
-                    write_arrays(mine, arrays, {"number": number, "proof": proof})
+                    write_arrays(temporary, arrays, {"number": number, "proof": proof})
                     try:
-                        os.link(mine, self._path(number))  # unlike a rename, it never replaces another's episode
+                        os.link(temporary, self._path(number))  # unlike a rename, it never replaces another's episode
                         break
                     except FileExistsError:
                         number += 1
                 sync_directory(self.folder)
         finally:
-            with contextlib.suppress(OSError):  # the episode is there, or not: what is left besides does no harm
-                mine.unlink()
+            with contextlib.suppress(OSError):  # a leftover does no harm
+                temporary.unlink()
         self.read = number + 1
         return self._path(number)
 
@@ -150,13 +150,13 @@ class EpisodeLog:
         # Under another's number, it would be learned from twice, and the other one lost.
         if (own := meta.get("number", number)) != number:
             raise RunDirectoryError(
-                f"{path} was renamed: expected episode {number}, got {brief(own)}; put it back where it was, or hand "
-                "over its arrays with metrpo.append_episode"
+                f"{path} was renamed: expected episode {number}, got {brief(own)}; restore its name, or add its arrays "
+                "with metrpo.append_episode"
             )
         try:
             return self._checked(arrays), meta.get("proof") is True
         except ValueError as error:
-            raise RunDirectoryError(f"{path} holds no episode of this run ({error}); move it away to go on") from None
+            raise RunDirectoryError(f"{path} holds no episode of this run ({error}); remove it to continue") from None
 
     def _checked(self, arrays: dict[str, np.ndarray]) -> Episode:
         if set(arrays) != set(Episode._fields):
@@ -211,19 +211,19 @@ def _finite(array: np.ndarray) -> bool:
 def append_episode(
     run_dir: str | Path, states: Sequence[Any], actions: Sequence[Any], rewards: Sequence[float], terminated: bool
 ) -> Path:
-    """Hands a run one real episode of L steps, to learn from in its next iteration; needs NumPy only.
+    """Adds one real episode of L steps to a run, which learns from it in its next iteration; needs NumPy only.
 
-    `states` [L + 1, O], what was observed, with the one after the last step (also where the policy has a history),
-    `actions` [L, A] in [-1, 1] as executed, `rewards` [L]; `terminated`: the task ended the episode, not the
-    clock. May be called while another program improves the policy. Returns the file, which is whole when this returns.
+    `states` [L + 1, O] are the observations, including the one after the last step (also where the policy has a
+    history); `actions` [L, A] in [-1, 1] as executed; `rewards` [L]; `terminated`: whether the task, not the time
+    limit, ended the episode. May be called while another program improves the policy. Returns the episode's file.
 
     Raises `TaskError` when the arrays do not fit each other or the run's policy, or are not finite;
     `RunDirectoryError` when `run_dir` holds no run or cannot be written.
     """
     info = load_policy(run_dir).info
-    given = {"states": states, "actions": actions, "rewards": rewards}
+    lists = {"states": states, "actions": actions, "rewards": rewards}
     with np.errstate(over="ignore"):  # infinity is refused below
-        arrays = {n: np.asarray(value, np.float64 if n == "states" else np.float32) for n, value in given.items()}
+        arrays = {n: np.asarray(value, np.float64 if n == "states" else np.float32) for n, value in lists.items()}
     length = len(arrays["rewards"])
     shapes = {
         "states": (length + 1, info.observation_size),
@@ -235,7 +235,7 @@ def append_episode(
             expected = list(shapes[name]) if length else "at least one step"
             raise TaskError(f"append_episode: {name}: expected {expected}, got shape {list(array.shape)}")
         if not _finite(array):
-            raise TaskError(f"append_episode: {name}: expected finite numbers; cut the episode before the first other")
+            raise TaskError(f"append_episode: {name}: expected finite numbers; cut the episode before the others")
     beyond = float(np.abs(arrays["actions"]).max())
     if beyond > 1 + 1e-6:
         raise TaskError(f"append_episode: actions: expected numbers in [-1, 1], got {beyond:.4g}; divide by the range")

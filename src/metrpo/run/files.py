@@ -96,7 +96,7 @@ def write_arrays(path: Path, arrays: Mapping[str, np.ndarray], meta: Mapping[str
     body = buffer.getvalue()[:-_DIGEST_SIZE]
     if len(body) > LARGEST_FILE - _DIGEST_SIZE or len(text) > LARGEST_TEXT:
         raise RunDirectoryError(
-            f"cannot write {path}: {len(body):,} bytes would not be read again; keep fewer transitions"
+            f"cannot write {path}: {len(body):,} bytes are more than can be read again; keep fewer transitions"
         )
     atomic_write(path, body + _digest(body))
 

@@ -1,4 +1,4 @@
-"""Finds runs on disk and reads what they have written; what is damaged is named and left out."""
+"""Finds runs on disk and reads their files; damaged runs are named and skipped."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _INSIDE = {"checkpoints", "episodes", "events", ".git", ".venv", "node_modules",
 
 @dataclass(frozen=True)
 class SeenRun:
-    """A run as it lies on disk."""
+    """A run on disk."""
 
     path: Path
     config: Config
     rows: list[Row]
-    """Its finished iterations; none while it is in its first."""
+    """Its finished iterations; none during the first."""
     details: list[Row] = field(default_factory=list)
-    """Of diagnostics.csv, each with its iteration; none of a run from before it was written."""
+    """The rows of diagnostics.csv, each with its iteration; none for runs from before that file."""
     yardsticks: dict[str, float] = field(default_factory=dict)
-    """What no skill earns, by name; empty where that was not measured."""
+    """Returns without skill, by name; empty where they were not measured."""
 
     def column(self, name: str) -> np.ndarray:
         """One number an iteration, of metrics.csv or else of diagnostics.csv; NaN where there is none."""
@@ -43,7 +43,7 @@ class SeenRun:
 
 
 class Skipped(NamedTuple):
-    """What looks like a run and cannot be read."""
+    """A folder that looks like a run and cannot be read."""
 
     path: Path
     why: str
@@ -57,7 +57,7 @@ class FoundRuns(NamedTuple):
 
 
 def find(paths: Sequence[Path]) -> FoundRuns:
-    """The runs that `paths` are or have inside, each once.
+    """The runs at or below `paths`, each once.
 
     A run is a folder with a config.json and, once an iteration is finished, a metrics.csv. Raises `RunDirectoryError`
     when a path does not exist, when there is no run at all, or when none can be read.
@@ -92,7 +92,7 @@ def read(folder: Path) -> SeenRun:
     try:
         config = from_json(file.read_text())
     except (OSError, ConfigError, UnicodeDecodeError) as error:
-        raise RunDirectoryError(f"{file} cannot be read: {error}; put it back or leave the run out") from None
+        raise RunDirectoryError(f"{file} cannot be read: {error}; put it back, or leave this run out") from None
     try:
         _require_whole(metrics)
         rows = read_metrics(metrics)
@@ -100,7 +100,7 @@ def read(folder: Path) -> SeenRun:
     except FileNotFoundError:
         rows = []  # in its first iteration
     except (OSError, ValueError, TypeError, csv.Error) as error:
-        raise RunDirectoryError(f"{metrics} cannot be read: {error}; put it back or leave the run out") from None
+        raise RunDirectoryError(f"{metrics} cannot be read: {error}; put it back, or leave this run out") from None
     return SeenRun(folder, config, rows, yardsticks=yardstick_record.kept(folder))
 
 
@@ -118,13 +118,13 @@ def _details(file: Path) -> list[Row]:
 
 
 def is_finished(run: SeenRun) -> bool:
-    """Whether the budget is spent, as far as the metrics say."""
+    """Whether the budget is spent, according to the metrics."""
     return budget.spent(run.config, run.rows)
 
 
 @dataclass(frozen=True)
 class Group:
-    """Runs of one task that differ in their seed and budget only: the seeds of one learning curve."""
+    """Runs of one task that differ only in seed and budget: the seeds of one learning curve."""
 
     task: str
     label: str
@@ -132,24 +132,24 @@ class Group:
 
 
 def group(runs: Sequence[SeenRun]) -> list[Group]:
-    """The runs by task and settings, tasks in order of their first run; labels say what tells a task's groups apart."""
-    found: list[list[SeenRun]] = []
+    """The runs by task and settings, tasks in order of their first run; labels tell a task's groups apart."""
+    alike: list[list[SeenRun]] = []
     for run in runs:
-        mine = next((g for g in found if not settings(g[0].config, run.config)), None)
-        if mine is None:
-            found.append([run])
+        own = next((g for g in alike if not settings(g[0].config, run.config)), None)
+        if own is None:
+            alike.append([run])
         else:
-            mine.append(run)
+            own.append(run)
     groups = []
     for task in dict.fromkeys(run.config.task for run in runs):
-        here = [g for g in found if g[0].config.task == task]
+        here = [g for g in alike if g[0].config.task == task]
         labels = _labels([g[0].config for g in here])
         groups += [Group(task, label, runs) for label, runs in zip(labels, here, strict=True)]
     return groups
 
 
 def no_skill(runs: Sequence[SeenRun]) -> dict[str, float]:
-    """What no skill earns on the runs' task, by name: the mean over the runs that have measured it, empty for none."""
+    """Returns without skill on the runs' task, by name: means over the runs that measured them, empty for none."""
     measured = [run.yardsticks for run in runs if run.yardsticks]
     return {name: float(np.mean([one[name] for one in measured])) for name in (measured[0] if measured else {})}
 
@@ -160,11 +160,11 @@ def settings(old: Config, new: Config) -> dict[str, tuple[object, object]]:
 
 
 def told_apart(runs: Sequence[SeenRun]) -> list[dict[str, str]]:
-    """For each run the settings in which those of its task, system and preset differ, and its values of them."""
+    """For each run, its values of the settings in which the runs of its task, system and preset differ."""
     alike: dict[tuple[str, ...], list[Config]] = {}
     for run in runs:
         alike.setdefault(_kind(run.config), []).append(run.config)
-    names = {k: dict.fromkeys(n for c in of for n in settings(of[0], c)) for k, of in alike.items()}
+    names = {kind: dict.fromkeys(n for c in cs for n in settings(cs[0], c)) for kind, cs in alike.items()}
     return [{name: _value(run.config, name) for name in names[_kind(run.config)]} for run in runs]
 
 
@@ -173,13 +173,13 @@ def _kind(config: Config) -> tuple[str, ...]:
 
 
 def _labels(configs: list[Config]) -> list[str]:
-    """A name for each of some configs of one task: the system, and where that is not enough the settings."""
+    """A name for each config of one task: the system and, where that is not enough, the settings."""
     systems = [str(c.system) for c in configs]
     names: list[str] = []
     for config in configs:
         alike = [c for c in configs if c.system == config.system]
-        told = list(dict.fromkeys(n for c in alike for n in settings(alike[0], c)))
-        words = [f"{n}={_value(config, n)}" for n in told[:3]] + (["..."] if len(told) > 3 else [])
+        differing = list(dict.fromkeys(n for c in alike for n in settings(alike[0], c)))
+        words = [f"{n}={_value(config, n)}" for n in differing[:3]] + (["..."] if len(differing) > 3 else [])
         names.append(
             ", ".join([str(config.system), *words]) if systems.count(str(config.system)) > 1 else config.system
         )
@@ -203,14 +203,14 @@ def _folders(path: Path) -> list[Path]:
 
 
 def _require_whole(metrics: Path) -> None:
-    """Raises `ValueError` for a copy that ends early: the reader would take missing cells for empty ones."""
+    """Raises `ValueError` for a truncated copy: the reader would mistake missing cells for empty ones."""
     lines = metrics.read_text().split("\n")
     if lines.pop() or any(line.count(",") != lines[0].count(",") for line in lines):
         raise ValueError("it was cut within a row")
 
 
 def _require_sense(rows: list[Row], needed: Sequence[str]) -> None:
-    """Raises `ValueError` for what no run writes: the file was cut or edited."""
+    """Raises `ValueError` for rows that no run writes: the file was truncated or edited."""
     if not rows:
         raise ValueError("expected a row for each iteration, got none")
     columns = list(rows[0])

@@ -1,4 +1,4 @@
-"""A finished run's policy for the Hugging Face hub: what is sent, and the sending."""
+"""Uploads a finished run's policy to the Hugging Face hub."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WHERE_THERE = {"curve.png": "curve.png", "video.mp4": "replay.mp4"}
 
 @dataclass(frozen=True)
 class Parcel:
-    """What is sent: names on the hub, each with its content or the file that has it."""
+    """The upload: names on the hub, each with its content or the file that has it."""
 
     repo: str
     files: dict[str, bytes | Path]
@@ -38,7 +38,7 @@ class Parcel:
 
 
 def parcel(run_dir: Path, repo: str | None, owner: str = "OWNER") -> Parcel:
-    """What `push` sends of a run; without `repo`, to `owner`'s repository metrpo-TASK.
+    """The files that `push` uploads; without `repo`, to `owner`'s repository metrpo-TASK.
 
     Raises `RunDirectoryError` unless it is the directory of a finished run, `MetrpoError` for an impossible `repo`.
     """
@@ -53,7 +53,7 @@ def parcel(run_dir: Path, repo: str | None, owner: str = "OWNER") -> Parcel:
 
 
 def owner_of_token() -> str:
-    """Who is logged in. Raises `MetrpoError` without the extra, when nobody is, or the hub cannot be reached."""
+    """The user who is logged in. Raises `MetrpoError` without the extra, without a login or without a connection."""
     hub = library()
     _require_token(hub)
     with asked("expected the hub to say whose token this is"):
@@ -61,7 +61,7 @@ def owner_of_token() -> str:
 
 
 def send(sent: Parcel, private: bool = False) -> str:
-    """Sends it as one commit, to a repository that is made where there is none; returns its address.
+    """Uploads it as one commit, to a repository that is created if there is none; returns its address.
 
     Raises `MetrpoError` without the extra or when nobody is logged in, `RunDirectoryError` when the hub refuses it or
     cannot be reached.
@@ -79,21 +79,21 @@ def send(sent: Parcel, private: bool = False) -> str:
 def _require_token(hub: object) -> None:
     if not hub.get_token():  # type: ignore[attr-defined]
         raise MetrpoError(
-            "expected to be logged in to the Hugging Face hub, found no token; run: hf auth login, or set "
-            "HF_TOKEN to a token that may write"
+            "expected a login to the Hugging Face hub, got no token; run: hf auth login, or set HF_TOKEN to a token "
+            "with write access"
         )
 
 
 def _finished(run_dir: Path) -> SeenRun:
     if is_name(run_dir):
-        raise RunDirectoryError(f"{run_dir}: expected the directory of a run of yours, got a policy's name")
+        raise RunDirectoryError(f"{run_dir}: expected the directory of your own run, got a policy's name")
     if missing := [name for name in _NEEDED if not (run_dir / name).is_file()]:
-        raise RunDirectoryError(f"{run_dir}: expected the directory of a finished run, got none with {missing[0]}")
+        raise RunDirectoryError(f"{run_dir}: expected the directory of a finished run, got one without {missing[0]}")
     run = read(run_dir)
     if not is_finished(run):
         raise RunDirectoryError(
-            f"{run_dir}: expected a finished run, got one of {len(run.rows)} iterations whose budget is not spent; go "
-            "on with the command that began it, or with a smaller budget"
+            f"{run_dir}: expected a finished run, got one of {len(run.rows)} iterations whose budget is not spent; "
+            "resume it with its own command, or give it a smaller budget"
         )
     return run
 

@@ -1,4 +1,4 @@
-"""Claiming a run directory: create or recognise it, lock it, and check its settings before anything is written."""
+"""Locks a run directory: creates or recognises it, and checks its settings before anything is written."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class DirectoryInUse(RunDirectoryError):
 def claim(path: Path, config: Config) -> TextIO:
     """Makes `path` the run directory of `config`, or checks that it is; returns its lock, held until closed.
 
-    A run that ended before it had an episode or a checkpoint has nothing to lose: its settings are replaced.
+    A run without an episode or a checkpoint has nothing to lose: its settings are replaced.
 
     Raises `RunDirectoryError` when it cannot be written, is in use by another process, holds something else, a run of
     another version or one with other settings; nothing in it has been changed then.
@@ -76,7 +76,7 @@ def _create(path: Path) -> None:
         ) from error
     if foreign and "run.json" not in foreign:
         raise RunDirectoryError(
-            f"{path} is no run directory: expected it empty or with a run.json, got {', '.join(sorted(foreign)[:3])}; "
+            f"{path} is no run directory: expected an empty one or a run.json, got {', '.join(sorted(foreign)[:3])}; "
             f"choose another directory (--run-dir), such as {path / 'new'}"
         )
 
@@ -100,7 +100,7 @@ def hold(path: Path) -> TextIO:
     except OSError as error:
         file.close()
         raise RunDirectoryError(f"cannot lock {path}: {error.strerror}; choose a directory on another disk") from error
-    with contextlib.suppress(OSError):  # on a full disk it holds all the same, and only does not say whose it is
+    with contextlib.suppress(OSError):  # on a full disk the lock holds anyway, without the holder's name
         os.ftruncate(file.fileno(), 0)
         os.write(file.fileno(), str(os.getpid()).encode())
     return file
@@ -109,9 +109,9 @@ def hold(path: Path) -> TextIO:
 def _lock(file: TextIO) -> None:
     """Raises `BlockingIOError` when another process has locked it, `OSError` when that cannot be done here."""
     try:
-        import fcntl  # of Unix alone
+        import fcntl  # Unix only
     except ImportError:
-        _log.warning("this system has no file locks of Unix: see to it that no other process writes to this directory")
+        _log.warning("this system has no Unix file locks: make sure that no other process writes to this directory")
         return
     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
@@ -153,7 +153,7 @@ def _check_or_write_config(file: Path, config: Config, begun: bool) -> None:
 
 
 def require_same(stored: Config, asked: Config, where: Path | str, folder: Path) -> None:
-    """Raises `RunDirectoryError` with a table of the settings in which `where` differs from what was asked for."""
+    """Raises `RunDirectoryError` with a table of the settings in which `where` differs from `asked`."""
     changed = configs.difference(stored, asked)
     if changed:
         width = max(len(name) for name in changed)
@@ -162,5 +162,5 @@ def require_same(stored: Config, asked: Config, where: Path | str, folder: Path)
         )
         raise RunDirectoryError(
             f"{where} holds a run with other settings:\n{table}\nask for the same settings, choose another directory "
-            f"(--run-dir DIR), or begin anew: delete {shlex.quote(str(folder))} first"
+            f"(--run-dir DIR), or start anew: delete {shlex.quote(str(folder))} first"
         )

@@ -1,4 +1,4 @@
-"""The machine: environment variables that must stand before JAX and NumPy are imported."""
+"""The machine: environment variables that must be set before JAX and NumPy are imported."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def _require_device(device: Literal["cpu", "gpu"] | None) -> None:
         cpu = {d.platform for d in devices} == {"cpu"}
         found = "only the CPU" if cpu else f"only {', '.join(names)}"
         raise MetrpoError(
-            f"device: JAX finds no GPU here, {found}; install JAX for it ({INSTALL_GPU}), or use --device cpu"
+            f"device: expected a GPU, JAX finds {found}; install JAX for it ({INSTALL_GPU}), or use --device cpu"
         )
 
 

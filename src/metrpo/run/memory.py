@@ -1,4 +1,4 @@
-"""Whether a run's arrays fit into this machine, asked before the first of them is made."""
+"""Checks that a run's arrays fit into memory, before the first of them is created."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from metrpo.world.task import Task
 _FLOAT = 4
 """Bytes of a number."""
 _COPIES = 4
-"""Of every weight while it learns: itself, the best so far, and Adam's two moments."""
+"""Copies of every weight during training: itself, the best so far, and the optimizer's two."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Need:
     """Its name, "imagine.steps"."""
     value: object
     what: str
-    """Whose memory it is."""
+    """What takes the memory."""
     size: int
     """Bytes."""
 
@@ -35,8 +35,8 @@ def require_memory(config: Config, task: Task) -> None:
     for need in _needs(config, task):
         if need.size > there:
             raise ConfigError(
-                f"{need.setting}: expected what fits into the {_gib(there)} of memory here, got {need.value}, for "
-                f"which {need.what} alone take {_gib(need.size)}; choose less"
+                f"{need.setting}: expected a value that fits into {_gib(there)} of memory, got {need.value}, for which "
+                f"{need.what} alone take {_gib(need.size)}; choose a smaller one"
             )
 
 
@@ -51,11 +51,11 @@ def _needs(config: Config, task: Task) -> list[Need]:
         imagined = config.imagine.steps * (2 * s + a) * _FLOAT
         starts = e.members * config.validate.starts * s * _FLOAT
         needs += [
-            Need("ensemble.hidden", e.hidden, "one model's weights and their optimizer", network),
-            Need("ensemble.members", e.members, "the models' weights and their optimizer", e.members * network),
+            Need("ensemble.hidden", e.hidden, "one model's weights and optimizer state", network),
+            Need("ensemble.members", e.members, "the models' weights and optimizer states", e.members * network),
             Need("imagine.steps", config.imagine.steps, "imagined transitions", imagined),
-            Need("fit.batch_size", config.fit.batch_size, "the batches of a training step", batch),
-            Need("validate.starts", config.validate.starts, "the states from which models validate", starts),
+            Need("fit.batch_size", config.fit.batch_size, "the minibatches of a step", batch),
+            Need("validate.starts", config.validate.starts, "the start states of validation", starts),
         ]
         if config.advantage.baseline == "network":
             needs.append(Need("advantage.value_hidden", config.advantage.value_hidden, "the value network", value))

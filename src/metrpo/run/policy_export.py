@@ -46,7 +46,7 @@ def export(run_dir: Path, out: Path | None = None) -> Path:
     written.
     """
     if out is None and is_name(run_dir):
-        raise MetrpoError(f"{run_dir}: expected where to write it, for it is no run directory; add --out policy.py")
+        raise MetrpoError(f"{run_dir}: expected --out, because this is no run directory; add --out policy.py")
     run_dir = located(run_dir)
     source = run_dir if run_dir.suffix == ".npz" else run_dir / FILE
     out = source.with_name("policy.py") if out is None else out
@@ -56,7 +56,7 @@ def export(run_dir: Path, out: Path | None = None) -> Path:
         _require_importable(out)
     policy = _completed(load_policy(run_dir))
     if out.suffix == ".py" and out.is_file() and not _is_ours(out):
-        raise MetrpoError(f"{out} exists and is no exported policy: choose another name, or remove it first")
+        raise MetrpoError(f"{out} exists and is no exported policy; choose another name, or remove it first")
     atomic_write(out, _WRITERS[out.suffix](policy, source))
     return out
 

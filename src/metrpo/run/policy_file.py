@@ -28,12 +28,12 @@ FILE = "policy.npz"
 
 @dataclass(frozen=True)
 class PolicyInfo:
-    """What a policy is for and where it comes from."""
+    """A policy's task, sizes, limits and origin."""
 
     task: str
     """Name of the task it was trained on."""
     observation_size: int
-    """O, of what it is called with."""
+    """O, the size of an observation."""
     action_size: int
     """A"""
     hidden: tuple[int, ...]
@@ -41,25 +41,25 @@ class PolicyInfo:
     iteration: int
     """Outer iterations of training."""
     real_steps: int
-    """Real steps it has learnt from."""
+    """Real steps that it learned from."""
     return_real: float | None
     """Mean real return of the deterministic policy at that time."""
     activation: str = "tanh"
     """Of the hidden layers; the output layer is linear, clipped to [-1, 1]."""
     observation: tuple[tuple[int, str], ...] | None = None
-    """The parts of an observation, in order: how many numbers, and what they are; None: unknown."""
+    """The parts of an observation, in order: size and description; None: unknown."""
     action_low: tuple[float, ...] | None = None
-    """[A], what the environment takes for an action of -1; None: unknown."""
+    """[A], the environment's action for -1; None: unknown."""
     action_high: tuple[float, ...] | None = None
-    """[A], what it takes for an action of 1; None: unknown."""
+    """[A], the environment's action for 1; None: unknown."""
     env_kwargs: tuple[str, ...] = ()
-    """What its environment was made with, each KEY=VALUE (`metrpo.config.env_kwargs`)."""
+    """Keyword arguments of its environment, each KEY=VALUE (`metrpo.config.env_kwargs`)."""
     imports: tuple[str, ...] = ()
     """Modules that register its environment."""
     max_action: float = 1.0
     """Its actions stay within plus and minus this."""
     max_change: float | None = None
-    """Most that its actions change from one step to the next; None: any."""
+    """Limit on the change of its actions from one step to the next; None: no limit."""
     history: int = 1
     """Observations that its network sees: the newest, the older ones, and the actions between them."""
 
@@ -106,10 +106,10 @@ class Weights(Protocol):
 
 @dataclass(frozen=True)
 class LoadedPolicy:
-    """A deterministic policy: call it with observations, get actions.
+    """A deterministic policy: call it with observations to get actions.
 
-    Where it has a `max_change`, it remembers its last action, and with a `history` its last observations and the
-    actions between them: call it once a step, and `reset()` before each episode.
+    With a `max_change` it remembers its last action, with a `history` its last observations and the actions between
+    them. Then call it once a step, and `reset()` before each episode.
     """
 
     info: PolicyInfo
@@ -133,21 +133,20 @@ class LoadedPolicy:
         self._last.clear()
 
     def limited(self, action: Any) -> np.ndarray:
-        """An action [A] or [B, A], such as `unlimited` gives and with noise of one's own, within the policy's limits.
+        """An action [A] or [B, A] of your own (`unlimited` plus noise, say), cut to the policy's limits.
 
-        Remembers it as the last one, also for a history. Raises `ValueError` when the one before was for other robots:
-        of another shape.
+        Remembers it as the last one, also for a history. Raises `ValueError` when its shape is not the last one's.
         """
-        given, before = np.asarray(action, np.float32), self._last.get("action")
-        if before is not None and before.shape != given.shape:
-            expected, got = list(before.shape), list(given.shape)
+        wanted, before = np.asarray(action, np.float32), self._last.get("action")
+        if before is not None and before.shape != wanted.shape:
+            expected, got = list(before.shape), list(wanted.shape)
             raise ValueError(f"action: expected shape {expected} as in the step before, got {got}; call reset() first")
-        found = Limits.of(self.info).within(given, before).astype(np.float32)
+        limited = Limits.of(self.info).within(wanted, before).astype(np.float32)
         if self.info.max_change is not None:
-            self._last["action"] = found
+            self._last["action"] = limited
         if self.info.history > 1:
-            self._last["taken"] = found
-        return found
+            self._last["taken"] = limited
+        return limited
 
     def unlimited(self, observation: Any) -> np.ndarray:
         """The action in [-1, 1] before the policy's limits, float32: [O] -> [A] or [B, O] -> [B, A].
@@ -178,8 +177,8 @@ class LoadedPolicy:
         if action is None or action.shape != wanted:
             came = "none" if action is None else f"one of {list(action.shape)}"
             raise ValueError(
-                f"observation: expected an action of shape {list(wanted)} since the one before, got {came}: call "
-                "limited(action) with what is executed, or reset() to begin an episode"
+                f"observation: expected an action of shape {list(wanted)} since the one before, got {came}; call "
+                "limited(action) with the executed action, or reset() to begin an episode"
             )
         return layout.follow(before, action, observed)
 
@@ -221,10 +220,10 @@ class LoadedPolicy:
 def _as_batch(observation: Any, size: int, kind: type) -> np.ndarray:
     """Raises `ValueError` unless it is of shape [size] or [B, size]."""
     with np.errstate(over="ignore"):
-        found: np.ndarray = np.asarray(observation, dtype=kind)
-    if found.ndim not in (1, 2) or found.shape[-1] != size:
-        raise ValueError(f"observation: expected shape [{size}] or [B, {size}], got {list(found.shape)}")
-    return found
+        batch: np.ndarray = np.asarray(observation, dtype=kind)
+    if batch.ndim not in (1, 2) or batch.shape[-1] != size:
+        raise ValueError(f"observation: expected shape [{size}] or [B, {size}], got {list(batch.shape)}")
+    return batch
 
 
 def save_policy(
@@ -275,12 +274,12 @@ def load_policy(directory: str | Path) -> LoadedPolicy:
     """The policy of a run directory, of `zoo:NAME`, of `hub:OWNER/NAME` on the Hugging Face hub (extra `hub`), or of a
     `policy.npz` itself; needs NumPy only.
 
-    Raises `RunDirectoryError` when there is none, or it is damaged, of another version or cannot act: other arrays than
-    its sizes say, or weights that are not finite.
+    Raises `RunDirectoryError` when there is none, or it is damaged, of another version, or unusable: its arrays do not
+    fit its sizes, or its weights are not finite.
     """
     path = located(directory)
     if path.suffix != ".npz" and path.is_file():
-        raise RunDirectoryError(f"{path} is a file; expected a run directory, or a policy.npz")
+        raise RunDirectoryError(f"{path}: expected a run directory or a policy.npz, got another file")
     path = path if path.suffix == ".npz" else path / FILE
     if not path.exists():
         raise RunDirectoryError(f"{directory} holds no policy: {_where_else(path)}")
@@ -290,14 +289,14 @@ def load_policy(directory: str | Path) -> LoadedPolicy:
 
 
 def _where_else(path: Path) -> str:
-    """What to do where `path` is missing."""
+    """What was expected, what was found, and what to do, where `path` is missing."""
     if path.name != FILE:
         return f"expected the file {path}, got none; give a run directory, or a policy.npz"
     folder = path.parent
     if run := inside(folder, FILE):
         return f"expected one run's directory, got a folder of runs; name one of them, such as {run}"
     if (folder / "config.json").exists():
-        return f"expected {path}, got a run whose first iteration is not finished; go on with the command that began it"
+        return f"expected {path}, got a run whose first iteration is not finished; resume it with its own command"
     return f"expected {path}; train one with: metrpo train TASK --run-dir {folder}"
 
 
@@ -307,7 +306,7 @@ def _info(stored: Any, path: Path) -> PolicyInfo:
     if missing:
         raise RunDirectoryError(f"{path} is no policy: it lacks {', '.join(missing)}")
     if unknown := [name for name in stored if name not in names]:
-        raise RunDirectoryError(f"{path}: expected what this version knows of a policy, got {brief(unknown)}")
+        raise RunDirectoryError(f"{path}: expected the fields that this version knows, got {brief(unknown)}")
     stored = _SINCE | stored
     sizes, parts = stored["hidden"], stored["observation"]
     for name, sound, expected in (

@@ -1,4 +1,4 @@
-"""Where a run's task lies: the name in its settings, file.py:name or module:name, means it from one directory only."""
+"""Where a run's task lies: a name such as file.py:name or module:name is valid from one directory only."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _FILE, _FOLDER, _IMPORTS = "task_file", "task_folder", "import_folders"
 
 
 class Choice(Protocol):
-    """What says which task a run has: its settings, or what its policy's file says of it."""
+    """Says which task a run has: its settings, or its policy's file."""
 
     @property
     def task(self) -> str:
@@ -23,7 +23,7 @@ class Choice(Protocol):
 
     @property
     def env_kwargs(self) -> tuple[str, ...]:
-        """What its environment is made with."""
+        """Keyword arguments of its environment."""
 
     @property
     def imports(self) -> tuple[str, ...]:
@@ -39,24 +39,24 @@ def remember(run_dir: str | Path, choice: Choice) -> None:
 
 
 def task_of_run(run_dir: str | Path, choice: Choice) -> Task:
-    """The task as the run has it: from where its file or module lay, if it is still there, or as the name says.
+    """The run's task: from where its file or module was, if it is still there, else by its name.
 
     From then on the name means that task in this process. Raises `TaskError` when there is none.
     """
-    task, given = choice.task, choice.env_kwargs
+    task, kwargs = choice.task, choice.env_kwargs
     noted, file = about(run_dir), resolve.file_of(task)
-    lay, folder = noted.get(_FILE), noted.get(_FOLDER)
+    path, folder = noted.get(_FILE), noted.get(_FOLDER)
     try:
         _import_again(noted.get(_IMPORTS), choice.imports)
-        if file is not None and isinstance(lay, str) and Path(lay).name == file.name and Path(lay).is_file():
-            return resolve.place(task, get_task(f"{lay}:{task.rpartition(':')[2]}", given), given)
+        if file is not None and isinstance(path, str) and Path(path).name == file.name and Path(path).is_file():
+            return resolve.place(task, get_task(f"{path}:{task.rpartition(':')[2]}", kwargs), kwargs)
         if isinstance(folder, str) and resolve.is_in(Path(folder), task):
-            found = resolve.resolve(task, Path(folder), given)
-            assert found is not None, "it has a colon"
-            return resolve.place(task, found, given)
-        return get_task(task, given)
+            resolved = resolve.resolve(task, Path(folder), kwargs)
+            assert resolved is not None, "it has a colon"
+            return resolve.place(task, resolved, kwargs)
+        return get_task(task, kwargs)
     except MissingTaskError as error:
-        raise MissingTaskError(f"{error}; if it has moved, say where: --task path/to/file.py:name") from error
+        raise MissingTaskError(f"{error}; if it has moved, give its new place: --task path/to/file.py:name") from error
 
 
 def _import_again(folders: Any, modules: tuple[str, ...]) -> None:
@@ -68,12 +68,12 @@ def _import_again(folders: Any, modules: tuple[str, ...]) -> None:
 
 
 def moved(choice: Choice, where: str) -> Task:
-    """The run's task, which now is what `where` names, in whatever this process does with the run.
+    """Lets the task at `where` stand for the run's task in this process, and returns it.
 
     Raises `ConfigError` for a task that lies in no file or module, `TaskError` when there is none at `where`.
     """
     if ":" not in choice.task:
         raise ConfigError(
-            f"task: expected it for a run whose task lies in a file or module, got {where} for {choice.task}"
+            f"task: expected a run whose task lies in a file or module, got {choice.task}; leave out {where}"
         )
     return resolve.place(choice.task, get_task(where, choice.env_kwargs, choice.imports), choice.env_kwargs)

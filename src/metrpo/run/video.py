@@ -41,7 +41,7 @@ def record(make_env: Callable[..., Any], policy: Callable[[np.ndarray], np.ndarr
     """
     writers = {".mp4": _write_mp4, ".gif": _write_gif}
     if path.suffix not in writers:
-        raise VideoError(f"{path}: expected a file name that ends in .mp4 or .gif")
+        raise VideoError(f"{path}: expected a file name that ends in .mp4 or .gif, got {path.suffix or 'no ending'}")
     if path.suffix == ".mp4" and not has_encoder():
         raise VideoError(f"no video encoder: {INSTALL_EXTRA}, or choose a .gif")
     with _rendering():
@@ -124,7 +124,7 @@ def _episode(
     try:
         env = make_env(render_mode="rgb_array")
     except Exception as error:  # whatever somebody's constructor raises
-        raise _blame(error, 'the environment cannot be made with render_mode="rgb_array"') from error
+        raise _blame(error, 'cannot create the environment with render_mode="rgb_array"') from error
     with env_returns.closing(env, "the environment"):
         observation, _ = env.reset(seed=seed)
         frames, over = [_frame(env)], False
@@ -143,7 +143,7 @@ def _frame(env: Any) -> np.ndarray:
     if np.ndim(picture) != 3:
         raise VideoError(
             f"render: expected a picture [height, width, 3], got {type(picture).__name__}: let the environment return "
-            'one where render_mode is "rgb_array", or do without: --no-video'
+            'one where render_mode is "rgb_array", or skip the video: --no-video'
         )
     height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2  # what yuv420p can hold
     return np.ascontiguousarray(picture[:height, :width])
@@ -159,12 +159,12 @@ def _blame(error: Exception, what: str) -> VideoError:
     if any(map(_comes_from_gl, causes)):
         return VideoError(f"cannot render here ({said}): {INSTALL_GL}; see: metrpo doctor")
     if isinstance(cause, gymnasium.error.DependencyNotInstalled | ImportError):
-        install = INSTALL_EXTRA if "pygame" in str(cause) else "install what it names"
-        return VideoError(f"{what}: a package is missing ({said}): {install}, or do without: --no-video")
+        install = INSTALL_EXTRA if "pygame" in str(cause) else "install it"
+        return VideoError(f"{what}: a package is missing ({said}): {install}, or skip the video: --no-video")
     if isinstance(cause, NotImplementedError):
-        return VideoError("the environment has no render(): there is nothing to see; do without: --no-video")
-    advice = "let its constructor take render_mode" if isinstance(cause, TypeError) else "mend the environment"
-    return VideoError(f"{what} ({said}): {advice}, or do without: --no-video")
+        return VideoError("the environment has no render(), so there is nothing to see; skip the video: --no-video")
+    advice = "let its constructor take render_mode" if isinstance(cause, TypeError) else "repair the environment"
+    return VideoError(f"{what} ({said}): {advice}, or skip the video: --no-video")
 
 
 def _comes_from_gl(error: BaseException) -> bool:

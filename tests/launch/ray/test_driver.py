@@ -181,7 +181,7 @@ def test_what_is_asked_of_ray(on, monkeypatch, tmp_path):
     assert order.environment["XLA_FLAGS"] == "--xla_mine"
     assert (order.cpus, order.gpus) == (3, 0.5)
     assert "at most 2 at a time on the Ray cluster, 3 CPU and 0.5 GPU for each; 1 machines, 3 of 4 CPUs in use" in told
-    assert any("none of its machines has 3 CPU and 0.5 GPU" in line for line in told)
+    assert any("no machine of the cluster has 3 CPU and 0.5 GPU" in line for line in told)
     assert told[-1].startswith("[4/4] Swimmer/k-1/seed-")
     assert told[-1].endswith("iteration 3/3, 30 real steps, return 1.5, in 7 s")
     ray = FakeRay([Ended(0, (ROW,), 7.0)] * 4)
@@ -211,7 +211,7 @@ def test_a_failed_run_stops_no_other_and_its_reason_is_shown(on, tmp_path):
     assert "seed-0: FAILED after 7 s (exit code 2)" in text
     assert "      what went wrong" in text
     assert "seed-1: FAILED (MetrpoError): no such disk" in text
-    assert "seed-2: FAILED for its machine or worker was lost, 20 retries included (LostError)" in text
+    assert "seed-2: FAILED because its machine or worker was lost, after 20 retries (LostError)" in text
     assert "seed-3: FAILED" in text, "it ended short of its budget"
     failed, _ = on(FakeRay([Ended(1, (ROW,), 7.0), *[Ended(0, (ROW,), 7.0)] * 3]))
     assert failed == RUNS[:1]

@@ -89,7 +89,7 @@ def test_an_older_attempt_is_refused_and_holds_nothing(kept, out):
     first, _ = kept.begin(RUN)
     second, _ = kept.begin(RUN)
     kept.take(RUN, second, changes([("metrics.csv", b"second")]))
-    with pytest.raises(Superseded, match=r"seed-0: attempt 2 goes on with it; attempt 1 ends"):
+    with pytest.raises(Superseded, match=r"seed-0: attempt 2 continues it; attempt 1 ends"):
         kept.take(RUN, first, changes([("metrics.csv", b"first")], log=b"first"))
     with pytest.raises(Superseded):
         kept.take("Task/k-1/seed-1", 1, changes())

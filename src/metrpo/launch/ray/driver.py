@@ -1,7 +1,7 @@
-"""Many runs on a Ray cluster: each a task of its own, which Ray places, and starts again where its machine is lost.
+"""Many runs on a Ray cluster: one task each, which Ray places, and starts again where its machine is lost.
 
-Ray does the scheduling. What is ours: a task that is started again waits until nobody holds its run directory and goes
-on from the last checkpoint, and so does the next command after one that was killed; finished runs are not begun again.
+Ray does the scheduling. This module adds resuming: a task that is started again waits until no process holds its run
+directory, and resumes from the last checkpoint. So does the next command after a kill. Finished runs stay finished.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from metrpo.launch.run_spec import RunSpec
 from metrpo.launch.status import Tell, has_spent, log_of, tail, tell_failure, tell_success, words
 
 RETRIES = 20
-"""How often a run is begun again because its machine or its worker was lost. A run that ends with an error is not: it
-would do so again."""
+"""How often a run is started again because its machine or worker was lost. A run that ends with an error is not: the
+error would come again."""
 _POLL = 0.5
 """Seconds between two looks at the tasks."""
 _REPORT = 60.0
-"""Seconds between two lines on what goes on."""
+"""Seconds between two progress reports."""
 
 
 def run_on_ray(runs: list[RunSpec], out: Path, means: Means, tell: Tell) -> list[RunSpec]:
@@ -62,8 +62,8 @@ def run_on_ray(runs: list[RunSpec], out: Path, means: Means, tell: Tell) -> list
             time.sleep(_POLL)
             for ref in _ended(ray, list(under_way)):
                 run = under_way.pop(ref)
-                done = len(runs) - len(waiting) - len(under_way)
-                if _finish(ray, ref, run, out, f"{done}/{len(runs)}", tell):
+                ended = len(runs) - len(waiting) - len(under_way)
+                if _finish(ray, ref, run, out, f"{ended}/{len(runs)}", tell):
                     failed.append(run)
             if time.monotonic() - reported > _REPORT:
                 reported = time.monotonic()
@@ -97,7 +97,7 @@ def _connected(ray: Any, address: str | None) -> Iterator[None]:
         raise MetrpoError(
             f"cannot reach the Ray cluster {address or os.environ.get('RAY_ADDRESS', '')} "
             f"({str(error).splitlines()[0]}); start one with: ray start --head; if one is there and says "
-            "InvalidAuthToken: export RAY_AUTH_MODE=token"
+            "InvalidAuthToken, export RAY_AUTH_MODE=token"
         ) from error
     try:
         yield
@@ -107,11 +107,11 @@ def _connected(ray: Any, address: str | None) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _heard() -> Iterator[list[int]]:
-    """The signals that ask to stop, as they come: what a handler raises would get lost within Ray's own code."""
+    """A list of the signals that ask to stop, as they come. (An exception in a handler would be lost in Ray's code.)"""
     heard: list[int] = []
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     for number, handler in before.items():
-        # A shell lets what it starts in the background ignore Ctrl-C: it stays so.
+        # A shell makes background commands ignore Ctrl-C: leave that as it is.
         if handler is not signal.SIG_IGN:
             signal.signal(number, lambda number, _: heard.append(number))
     try:
@@ -132,14 +132,14 @@ def _ended(ray: Any, refs: list[Any]) -> list[Any]:
 
 
 def _finish(ray: Any, ref: Any, run: RunSpec, out: Path, count: str, tell: Tell) -> bool:
-    """Tells how a run ended; whether it failed."""
+    """Reports how a run ended; returns whether it failed."""
     try:
         ended: worker.Ended = ray.get(ref)
     except ray.exceptions.RayTaskError as error:  # its machine could not even begin
         tell_failure(run, count, f"({type(error.cause).__name__}): {error.cause}", [], tell)
         return True
     except ray.exceptions.RayError as error:
-        why = f"for its machine or worker was lost, {RETRIES} retries included ({type(error).__name__}):"
+        why = f"because its machine or worker was lost, after {RETRIES} retries ({type(error).__name__}):"
         tell_failure(run, count, why, str(error).splitlines()[-5:], tell)
         return True
     if ended.code == 0 and has_spent(run, ended.rows):
@@ -152,10 +152,10 @@ def _finish(ray: Any, ref: Any, run: RunSpec, out: Path, count: str, tell: Tell)
 
 
 def _stop(ray: Any, refs: list[Any], heard: list[int], tell: Tell) -> None:
-    """Ends the runs and raises `Stopped`: asked once, each finishes its iteration; asked once more, they are killed."""
-    tell("stopping the runs at the end of an iteration; once more stops them at once")
+    """Stops the runs and raises `Stopped`: each finishes its iteration; after a second signal, they are killed."""
+    tell("stopping the runs at the end of an iteration; press again to stop at once")
     for ref in refs:
-        ray.cancel(ref, recursive=False)  # what it is sending to the store is to arrive
+        ray.cancel(ref, recursive=False)  # files on their way to the store must arrive
     while refs and len(heard) == 1:
         time.sleep(_POLL)
         ended = _ended(ray, refs)
@@ -167,11 +167,11 @@ def _stop(ray: Any, refs: list[Any], heard: list[int], tell: Tell) -> None:
 
 def _tell_resources(ray: Any, means: Means, tell: Tell) -> None:
     cpus, gpus = means.cpus or 1, means.gpus
-    at_a_time = f"at most {means.jobs}" if means.jobs else "as many as there is room for"
+    at_a_time = f"at most {means.jobs}" if means.jobs else "as many as fit"
     tell(f"{at_a_time} at a time on the Ray cluster, {cpus} CPU and {gpus:g} GPU for each; {_resources(ray)}")
     there = [node["Resources"] for node in ray.nodes() if node["Alive"]]
     if not any(node.get("CPU", 0) >= cpus and node.get("GPU", 0) >= gpus for node in there):
-        tell(f"none of its machines has {cpus} CPU and {gpus:g} GPU: the runs wait until one joins it")
+        tell(f"no machine of the cluster has {cpus} CPU and {gpus:g} GPU; the runs wait until one joins")
 
 
 def _resources(ray: Any) -> str:

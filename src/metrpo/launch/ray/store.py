@@ -1,7 +1,7 @@
-"""The run directories of machines without a common disk, kept by the driver's machine (see `metrpo.launch.ray.sync`).
+"""The run directories of machines without a shared disk, kept by the driver's machine (see `metrpo.launch.ray.sync`).
 
-Files come in the order in which a run writes them, each whole or not at all: a run directory is at every moment what
-a kill would have left of the run itself.
+Files arrive in the order in which a run writes them, each whole or not at all. So at every moment a run directory looks
+as a kill of the run itself would have left it.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from metrpo.run.files import atomic_write, make_directory, writing
 from metrpo.run.lock import hold
 
 Mark = tuple[int, int, int]
-"""What tells one version of a file from another: when it was written, its size, its inode."""
+"""Tells versions of a file apart: time of writing, size, inode."""
 
 
 class Superseded(MetrpoError):
-    """The run has been begun again elsewhere."""
+    """The run was started again elsewhere."""
 
 
 @dataclass(frozen=True)
 class Changes:
-    """What has happened in a run's folder since the last time."""
+    """The changes in a run's folder since the last time."""
 
     files: tuple[tuple[str, bytes], ...]
-    """Names and contents of those that are new or other than before, in the order in which they are to be written."""
+    """Names and contents of new and changed files, in the order in which to write them."""
     gone: tuple[str, ...]
     log: bytes
-    """What the run has said."""
+    """New output of the run."""
     log_start: int
-    """How much it had said before in this attempt, in bytes."""
+    """Bytes of its earlier output in this attempt."""
 
 
 class Store:
@@ -48,7 +48,7 @@ class Store:
         self._logs: dict[str, int] = {}
 
     def begin(self, run: str) -> tuple[int, dict[str, bytes]]:
-        """Hands a run to a new attempt: the attempt's number, and all files by their names. Ends all earlier ones.
+        """Starts a new attempt at a run: returns its number, and all files by name. Ends all earlier attempts.
 
         Raises `DirectoryInUse` when another process holds the run, `RunDirectoryError` when it cannot be used.
         """
@@ -63,13 +63,13 @@ class Store:
         return self._attempts[run], files
 
     def take(self, run: str, attempt: int, changes: Changes) -> None:
-        """Writes what has changed, each file whole or not at all; the same once more does no harm.
+        """Writes the changes, each file whole or not at all; writing them twice does no harm.
 
         Raises `Superseded` when the attempt is not the newest, `RunDirectoryError` for a name that is none of a run's
         files, before anything is written, and when something cannot be written.
         """
         if attempt != self._attempts.get(run):
-            raise Superseded(f"{run}: attempt {self._attempts.get(run)} goes on with it; attempt {attempt} ends")
+            raise Superseded(f"{run}: attempt {self._attempts.get(run)} continues it; attempt {attempt} ends")
         directory, log = self._places(run)
         files = [(within(directory, name), content) for name, content in changes.files]
         gone = [within(directory, name) for name in changes.gone]
@@ -86,7 +86,7 @@ class Store:
                 path.unlink()
 
     def end(self, run: str, attempt: int) -> None:
-        """Lets go of the run, unless another attempt has it."""
+        """Unlocks the run, unless another attempt has it."""
         if attempt == self._attempts.get(run) and run in self._locks:
             self._locks.pop(run).close()
 
@@ -105,8 +105,8 @@ def within(directory: Path, name: str) -> Path:
 
 
 def marks(directory: Path) -> dict[str, Mark]:
-    """The files of a run directory but hidden ones, which are its lock and those that are being written."""
-    found = {}
+    """The files of a run directory, except hidden ones: its lock, and files that are being written."""
+    versions = {}
     for folder, folders, names in os.walk(directory):
         folders[:] = [name for name in folders if not name.startswith(".")]
         for path in (Path(folder, name) for name in names if not name.startswith(".")):
@@ -114,5 +114,5 @@ def marks(directory: Path) -> dict[str, Mark]:
                 status = path.stat()
                 if stat.S_ISREG(status.st_mode):
                     name = PurePosixPath(path.relative_to(directory)).as_posix()
-                    found[name] = (status.st_mtime_ns, status.st_size, status.st_ino)
-    return found
+                    versions[name] = (status.st_mtime_ns, status.st_size, status.st_ino)
+    return versions

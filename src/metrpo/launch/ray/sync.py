@@ -1,7 +1,7 @@
-"""Runs on machines without a common disk: each works in a folder of its own machine, and its files go there and back.
+"""Runs on machines without a shared disk: each works in a folder on its own machine, and its files go there and back.
 
-The `Store`, a Ray actor on the driver's machine, has the run directories. A task that begins gets what is there now,
-and gives back what has changed: it looks several times a second, and takes a picture while the run is not writing.
+The `Store`, a Ray actor on the driver's machine, has the run directories. A new task receives their files, and sends
+back what changes: it looks several times a second, and takes a snapshot while the run is not writing.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from metrpo.run.files import writing
 from metrpo.run.lock import DirectoryInUse
 
 FIRST, LAST = ("run.json", "config.json", "episodes/", "checkpoints/"), "metrics.csv"
-"""How the names begin of what others rely on, and the file by which a run counts as finished."""
+"""Prefixes of the files that others rely on, and the file that makes a run count as finished."""
 _POLL = 1.0
-"""Seconds between two questions whether a run directory is free."""
+"""Seconds between two checks whether a run directory is free."""
 
 
 class Actor:
-    """A `Store` that is a Ray actor: each call returns when it is done, and raises what was raised there."""
+    """A `Store` as a Ray actor: each call returns when it is finished, and raises what the store raised."""
 
     def __init__(self, handle: Any) -> None:
         ray = importlib.import_module("ray")
 
         def call(method: Any) -> Callable[..., Any]:
-            def done(*arguments: Any) -> Any:
+            def wait_for(*arguments: Any) -> Any:
                 try:
                     return ray.get(method.remote(*arguments))
                 except ray.exceptions.RayTaskError as error:
                     raise error.cause from None
 
-            return done
+            return wait_for
 
         self.begin, self.take, self.end = call(handle.begin), call(handle.take), call(handle.end)
 
@@ -48,13 +48,13 @@ Keeper = Store | Actor
 
 
 def rank(name: str) -> tuple[int, str]:
-    """By what files are sorted before they are written: first what others rely on, `LAST` last."""
+    """Sort key of files before writing: first those that others rely on, `LAST` last."""
     place = next((i for i, start in enumerate(FIRST) if name.startswith(start)), len(FIRST))
     return len(FIRST) + 1 if name == LAST else place, name
 
 
 class Copy:
-    """A run's folder on the machine that works in it, and how much of it the keeper has."""
+    """A run's folder on the machine that works in it, and which part of it the keeper has."""
 
     def __init__(self, keeper: Keeper, run: str, directory: Path, log: Path) -> None:
         self._keeper, self._run, self._directory, self._log = keeper, run, directory, log
@@ -67,7 +67,7 @@ class Copy:
         self._known, self._said = marks(directory), 0
 
     def send(self) -> None:
-        """Gives the keeper what has changed; nothing while the run is writing. Raises what the keeper does."""
+        """Sends the changes to the keeper, but none while the run is writing. Raises what the keeper does."""
         now = marks(self._directory)
         names = sorted((name for name in now if now[name] != self._known.get(name)), key=rank)
         try:
@@ -76,13 +76,13 @@ class Copy:
             return
         if marks(self._directory) != now:
             return
-        log = self._new_words()
+        log = self._new_output()
         gone = tuple(sorted(self._known.keys() - now.keys()))
         if files or gone or log:
             self._keeper.take(self._run, self.attempt, Changes(files, gone, log, self._said))
             self._known, self._said = now, self._said + len(log)
 
-    def _new_words(self) -> bytes:
+    def _new_output(self) -> bytes:
         with open(self._log, "rb") as file:
             file.seek(self._said)
             return file.read()
@@ -100,9 +100,9 @@ def _begin(keeper: Keeper, run: str) -> tuple[int, dict[str, bytes]]:
 
 
 def attend(order: worker.Order, run: str, keeper: Keeper) -> worker.Ended:
-    """As `on_node.attend`, in a temporary folder of this machine that begins as the keeper's and is given back to it.
+    """As `worker.attend`, in a temporary folder on this machine that starts as the keeper's and is sent back to it.
 
-    Raises what the keeper does; the process of the run has ended then.
+    Raises what the keeper does; by then the run's process has ended.
     """
     with tempfile.TemporaryDirectory(prefix="metrpo-", ignore_cleanup_errors=True) as temporary:
         directory, log = Path(temporary, run), Path(temporary, f"{run}.log")
@@ -113,7 +113,7 @@ def attend(order: worker.Order, run: str, keeper: Keeper) -> worker.Ended:
         try:
             return worker.attend(here, copy.send)
         finally:
-            with contextlib.suppress(Exception):  # what has gone wrong before is what matters
+            with contextlib.suppress(Exception):  # an earlier error matters more
                 keeper.end(run, copy.attempt)
 
 

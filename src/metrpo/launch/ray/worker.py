@@ -1,4 +1,4 @@
-"""What a machine of a Ray cluster does for one run: `metrpo train` as a process of its own, looked after to its end.
+"""What a machine of a Ray cluster does for one run: starts `metrpo train` as a process, and watches it to its end.
 
 JAX stays out of Ray's worker, which may serve other runs afterwards; the worker's process only waits.
 """
@@ -32,11 +32,11 @@ FORWARDED = (
     "MINARI_",
     "PYTHONPATH",
 )
-"""How the names of the environment variables begin that a run depends on; Ray hands on none by itself."""
+"""Prefixes of the environment variables that a run depends on; Ray itself forwards none."""
 _POLL = 0.2
 """Seconds between two looks at the process."""
 PATIENCE = 300.0
-"""Seconds to wait for a run directory that another process holds: a machine that has lost its cluster takes a minute to
+"""Seconds to wait for a run directory that another process holds: a machine that lost its cluster takes a minute to
 notice, and then ends its run."""
 
 
@@ -62,19 +62,19 @@ class Ended:
 
     code: int
     rows: tuple[Row, ...]
-    """What it has measured, as its own machine sees it: another one's view of a shared disk may be seconds old."""
+    """Its metrics, as its own machine sees them: another machine's view of a shared disk may be seconds old."""
     seconds: float
 
 
 def forwarded(environment: Mapping[str, str]) -> dict[str, str]:
-    """Those of the variables that a run on another machine needs."""
+    """The environment variables that a run on another machine needs."""
     return {name: value for name, value in environment.items() if name.startswith(FORWARDED)}
 
 
 def surroundings(order: Order, here: Mapping[str, str]) -> dict[str, str]:
-    """The environment of a run: this machine's, Ray's choice of GPUs in it, what was forwarded, and its share.
+    """The environment of a run: this machine's, with Ray's choice of GPUs, the forwarded variables and the run's share.
 
-    Ray counts cores without assigning them: what XLA and BLAS would take by themselves is all of the machine.
+    Ray counts cores without assigning them: by themselves, XLA and BLAS would take the whole machine.
     """
     threads = ("NPROC", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
     share = dict.fromkeys(threads, str(order.cpus))
@@ -82,22 +82,22 @@ def surroundings(order: Order, here: Mapping[str, str]) -> dict[str, str]:
         share["JAX_PLATFORMS"] = "cpu"
     elif order.gpus < 1:  # by itself JAX takes three quarters of a GPU's memory
         share["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{0.9 * order.gpus:.3f}"
-    found = {**here, **share, **order.environment}
-    devices = "--xla_force_host_platform_device_count"
-    if devices not in found.get("XLA_FLAGS", ""):
-        found["XLA_FLAGS"] = f"{found.get('XLA_FLAGS', '')} {devices}={min(order.cpus, MAX_CPU_DEVICES)}".strip()
-    return found
+    variables = {**here, **share, **order.environment}
+    devices, flags = "--xla_force_host_platform_device_count", variables.get("XLA_FLAGS", "")
+    if devices not in flags:
+        variables["XLA_FLAGS"] = f"{flags} {devices}={min(order.cpus, MAX_CPU_DEVICES)}".strip()
+    return variables
 
 
 def attend(order: Order, look: Callable[[], None] = lambda: None) -> Ended:
-    """Runs it to its end, on from its last checkpoint; asked to stop (by Ray's KeyboardInterrupt), it asks the run.
+    """Runs it to its end, from its last checkpoint on; passes a request to stop (Ray's KeyboardInterrupt) to the run.
 
-    Meanwhile `look` is called again and again, and once more after the end; when that raises, the run is killed.
-    Raises `MetrpoError` when this machine cannot: a folder is not there, or another process holds the run.
+    Calls `look` repeatedly, and once after the end; when `look` raises, the run is killed. Raises `MetrpoError` when
+    this machine cannot run it: a folder is missing, or another process holds the run.
     """
     began, node = time.monotonic(), os.uname().nodename
     if not Path(order.folder).is_dir():
-        raise MetrpoError(f"{node}: expected the folder {order.folder}, got none: start from a disk that all share")
+        raise MetrpoError(f"{node}: expected the folder {order.folder}, got none; start from a shared disk")
     directory = Path(order.directory)
     try:
         directory.mkdir(parents=True, exist_ok=True)
