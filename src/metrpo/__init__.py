@@ -1,11 +1,11 @@
-"""Model-Ensemble Trust-Region Policy Optimization (Kurutach et al., 2018): control learnt from few real steps.
+"""Model-Ensemble Trust-Region Policy Optimization (Kurutach et al., 2018): control learned from few real steps.
 
     real environment --collect--> dataset --fit--> ensemble --imagine--> trajectories
             ^                                         |                      |
             +------------- accepted policy <--validate+------ improve <------+
 
 Train with `train(preset("Swimmer"), "runs/swimmer")`, use the result with `load_policy("runs/swimmer")`, judge it with
-`evaluate("runs/swimmer")`; `init` and `step` are the loop's two halves for those who drive it themselves.
+`evaluate("runs/swimmer")`; `init` and `step` are the loop's two halves, for callers who drive it themselves.
 """
 
 from __future__ import annotations

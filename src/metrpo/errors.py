@@ -10,15 +10,15 @@ class ConfigError(MetrpoError):
 
 
 class TaskError(MetrpoError):
-    """A task is unknown, or its environment broke its promise."""
+    """A task is unknown, or its environment does not keep Gymnasium's rules."""
 
 
 class MissingTaskError(TaskError):
-    """The file or module that a task's name says is not there."""
+    """The file or module in a task's name does not exist."""
 
 
 class EpisodeError(TaskError):
-    """An environment has failed in an episode, which may go better the next time."""
+    """An environment failed in an episode; another try may succeed."""
 
 
 class NotFiniteError(EpisodeError):
@@ -26,11 +26,11 @@ class NotFiniteError(EpisodeError):
 
 
 class UnplayableError(TaskError):
-    """So many episodes of an environment have failed that trying more is of no use."""
+    """Too many episodes of an environment have failed to try again."""
 
 
 class DivergedError(MetrpoError):
-    """Learning has left the finite numbers for good; nothing of its iteration has been saved."""
+    """Training diverged and cannot recover; nothing of the iteration was saved."""
 
 
 class RunDirectoryError(MetrpoError):

@@ -96,7 +96,7 @@ SAME_AS = {"HopperUpright": "Hopper", "HumanoidStandup": "Humanoid"}
 
 
 def preset(task: str, name: str = "fast", system: str = "me-trpo", **top_level: Any) -> Config:
-    """The config of a preset for a task and one of the paper's systems; `top_level` settings such as `seed=1` on top.
+    """The config of a preset for a task and one of the paper's systems, with `top_level` settings such as `seed=1`.
 
     Raises `ConfigError` for an unknown preset, system or setting.
     """
@@ -116,11 +116,11 @@ def preset(task: str, name: str = "fast", system: str = "me-trpo", **top_level: 
 
 
 _CHOOSE_ENV = ("env_kwargs", "imports")
-"""Settings without which a task may not be found, or have another horizon."""
+"""Settings that a task may need to be found, or to have its horizon."""
 
 
 def bare(task: str, name: str, system: str, settings: Overrides) -> Config:
-    """The config of a preset, with those of the dotted `settings` alone that say how the environment is made."""
+    """The config of a preset, with only those of the dotted `settings` that create the environment."""
     return preset(task, name, system, **{name: settings[name] for name in _CHOOSE_ENV if name in settings})
 
 

@@ -205,7 +205,7 @@ def test_several_runs_are_asked_twice():
     with pytest.raises(KeyboardInterrupt):
         local._stop([child], told.append)
     assert process.poll() == 0
-    assert told == ["stopping 1 run at the end of an iteration; once more stops them at once"]
+    assert told == ["stopping 1 run at the end of an iteration; press again to stop at once"]
 
 
 @pytest.mark.timeout(400)  # some 20 s of compilation on a quiet machine

@@ -261,10 +261,10 @@ def test_init_names_only_what_can_add_episodes_to_its_task(monkeypatch, capsys):
     )
     monkeypatch.setattr("metrpo.external.begin", lambda *_: None)
     assert main.main(["init", "arm.py:task", "--run-dir", "my arm"]) == 0
-    said = "add episodes (metrpo.append_episode, or metrpo collect 'my arm' --data FILE), then"
+    said = "add episodes (metrpo.append_episode, or metrpo collect 'my arm' --data FILE), then run"
     assert said in capsys.readouterr().out
     assert main.main(["init", "Swimmer", "--run-dir", "swim"]) == 0
-    assert "add episodes (metrpo collect swim), then" in capsys.readouterr().out
+    assert "add episodes (metrpo collect swim), then run" in capsys.readouterr().out
 
 
 def test_only_what_lies_in_a_file_or_module_can_have_moved():

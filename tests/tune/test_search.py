@@ -141,7 +141,7 @@ def test_ranges_and_choices_are_read_and_said_again(text, found):
     [
         ("trpo.max_kl", "search: expected NAME=A..B, log A..B, .* got 'trpo.max_kl'"),
         ("trpo.max_lk=0.1..1", "unknown setting 'trpo.max_lk'"),
-        ("trpo=0.1..1", "expected choices, for it is no number"),
+        ("trpo=0.1..1", "expected choices, because it is no number"),
         ("trpo.max_kl.x=0.1..1", "unknown setting"),
         ("trpo.max_kl=0.1..", "expected A..B"),
         ("trpo.max_kl=1...5", "expected A..B"),
@@ -153,7 +153,7 @@ def test_ranges_and_choices_are_read_and_said_again(text, found):
         ("trpo.max_kl=log 1..3 step 1", "expected log of numbers above 0 and without a step"),
         ("validate.patience=1.5..5", "expected whole numbers"),
         ("validate.patience=10..50 step 15", "expected a whole number of steps from 10 to 50"),
-        ("imagine.sampling=1..5", "expected choices, for it is no number"),
+        ("imagine.sampling=1..5", "expected choices, because it is no number"),
         ("ensemble.members=5", "expected at least two choices"),
         ("ensemble.members=5,5", "each once"),
         ("trpo.max_kl=1,1.0", "each once"),
@@ -173,7 +173,7 @@ def test_a_wrong_range_is_named(text, message):
         ({"space": {"ensemble.members": Choices((1, "many"))}}, "ensemble.members: expected int, got 'many'"),
         ({"space": {"imagine.sampling": Choices(("step_rand", "x"))}}, "imagine.sampling: expected one of"),
         ({"settings": {"trpo.damping": -1.0}}, "trpo.damping: expected a finite number >= 0"),
-        ({"settings": {"trpo.max_kl": 0.1}}, "got trpo.max_kl, which is to be fixed and searched"),
+        ({"settings": {"trpo.max_kl": 0.1}}, "got trpo.max_kl, which is both fixed and searched"),
         ({"space": {"seed": Range(0, 5)}}, "got seed, which has an option"),
         ({"space": {}}, "expected at least one setting"),
         ({"seeds": ()}, "one seed"),
@@ -357,7 +357,7 @@ def test_ctrl_c_stops_the_runs_and_the_same_command_goes_on(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         tune(search(), tmp_path / "broken", 1, told.append, fake)
     assert fake.terminated == ["Swimmer/trial-001/seed-0"]
-    assert told[-1] == "stopping 1 trial at the end of an iteration; once more stops them at once"
+    assert told[-1] == "stopping 1 trial at the end of an iteration; press again to stop at once"
     told.clear()
     assert outcome(tune(search(), tmp_path / "broken", 1, told.append, fake)) == expected
     assert told[0] == "1 of 8 trials are finished, 1 broken off"
@@ -376,7 +376,7 @@ def test_a_trial_that_fails_stops_its_seeds_and_no_other_trial(tmp_path):
 
 def test_when_all_fail_it_gives_up(tmp_path):
     fake = Fake(fails=[f"trial-{n:03d}/seed-0" for n in range(8)])
-    with pytest.raises(MetrpoError, match="3 trials have failed and none went well"):
+    with pytest.raises(MetrpoError, match="3 trials have failed and none succeeded"):
         tune(search(), tmp_path, 1, silent, fake)
     assert len(fake.begun) == 3
 

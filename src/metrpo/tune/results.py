@@ -1,4 +1,4 @@
-"""What a search has found: a record for each trial, the best ones as a table, and the command that repeats the best."""
+"""The results of a search: a record of each trial, a table of the best, and the command that repeats the best."""
 
 from __future__ import annotations
 
@@ -29,42 +29,42 @@ _WIDE = 160
 _SHOWN = 10
 """Trials in the table."""
 ENOUGH = 10
-"""Complete trials, below which nothing is said of a setting's importance: it would be that of chance."""
+"""Least number of complete trials that give a setting's importance; with fewer, it would be chance."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """A trial that is over."""
+    """A finished trial."""
 
     number: int
     state: TrialState
     value: float | None
-    """What it is worth (`OBJECTIVE`), or was when it was pruned."""
+    """Its value (`OBJECTIVE`), or the value when it was pruned."""
     returns: list[float]
-    """The same of each seed; nothing unless it is complete."""
+    """The value of each seed; empty unless the trial is complete."""
     iterations: int
-    """That all its seeds have finished."""
+    """Iterations that all its seeds have finished."""
     real_steps: int
-    """Of all its seeds."""
+    """Real steps of all its seeds."""
     settings: dict[str, Any]
-    """The searched ones."""
+    """The searched settings."""
     usual: bool
-    """Whether they are the preset's."""
+    """Whether these are the preset's."""
     failure: str | None
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """All trials so far that are over, in their order."""
+    """All finished trials so far, in order."""
 
     search: Search
     records: list[Record]
     importance: dict[str, float]
-    """Shares of the variance among good trials (PED-ANOVA), most important first; nothing where there are too few."""
+    """Shares of the variance among good trials (PED-ANOVA), most important first; empty where there are too few."""
 
     @property
     def best(self) -> Record | None:
-        """The complete trial that is worth most."""
+        """The complete trial with the highest value."""
         return max(self._complete, key=lambda r: r.value or 0.0, default=None)
 
     @property
@@ -73,7 +73,7 @@ class Tuned:
 
     @property
     def failed(self) -> list[Record]:
-        """Those that failed."""
+        """The failed trials."""
         return [r for r in self.records if r.state == "failed"]
 
     def command(self, record: Record) -> str:
@@ -94,22 +94,22 @@ class Tuned:
         }
 
     def print(self, console: Console | None = None) -> None:
-        """The best trials, what the others came to, and how to repeat the best."""
+        """Prints the best trials, a summary of all, and how to repeat the best."""
         console = console or Console(highlight=False)
         if not console.is_terminal:
             console.width = max(console.width, _WIDE)
         count = {state: sum(r.state == state for r in self.records) for state in _STATES.values()}
         steps = sum(r.real_steps for r in self.records)
         console.print(self._table())
-        told = ", ".join(f"{n} {state}" for state, n in count.items() if n)
+        outcomes = ", ".join(f"{n} {state}" for state, n in count.items() if n)
         trials, taken = counted(len(self.records), "trial"), counted(steps, "real step")
-        lines = [f"{trials}: {told or 'none is over'}; {taken}. Return: {OBJECTIVE}."]
+        lines = [f"{trials}: {outcomes or 'none finished'}; {taken}. Return: {OBJECTIVE}."]
         if self.importance:
             parts = ", ".join(f"{name} {share:.0%}" for name, share in self.importance.items())
             lines.append(f"importance (PED-ANOVA, of the complete trials): {parts}")
         if self.best is not None:
             others = "".join(f" {seed}" for seed in self.search.seeds[1:])
-            lines.append("The best again" + (f", with its first seed (others:{others})" if others else "") + ":")
+            lines.append("To repeat the best" + (f" with its first seed (others:{others})" if others else "") + ":")
             lines.append(f"\n  {self.command(self.best)}\n")
         for line in lines:
             console.print(Text(line), soft_wrap=True)
@@ -128,14 +128,14 @@ class Tuned:
 
 
 def tuned(study: Study, search: Search) -> Tuned:
-    """What the study says of its trials that are over."""
-    found = []
+    """The finished trials of a study."""
+    records = []
     for trial in study.get_trials(deepcopy=False):
         if trial.state.name not in _STATES:
             continue
         about, steps = trial.user_attrs, trial.intermediate_values
         settings = {name: search.space[name].value(label) for name, label in trial.params.items()}
-        found.append(
+        records.append(
             Record(
                 number=trial.number,
                 state=_STATES[trial.state.name],
@@ -148,7 +148,7 @@ def tuned(study: Study, search: Search) -> Tuned:
                 failure=about.get("failure"),
             )
         )
-    return Tuned(search, found, _importance(study, search))
+    return Tuned(search, records, _importance(study, search))
 
 
 def _importance(study: Study, search: Search) -> dict[str, float]:
@@ -161,22 +161,22 @@ def _importance(study: Study, search: Search) -> dict[str, float]:
 
 
 def describe(search: Search, out: Path) -> str:
-    """What is searched and where, in words; and what a trial runs."""
+    """The search in words: its trials, its settings and ranges, and the command of a trial."""
     trials, seeds = counted(search.trials, "trial"), counted(len(search.seeds), "seed")
     budget = counted(*((search.steps, "iteration") if search.real_steps is None else (search.real_steps, "real step")))
-    lines = [f"{out}: {trials} of {seeds}, {budget} each; searched are"]
+    lines = [f"{out}: {trials} of {seeds}, {budget} each; the search covers"]
     usual = search.usual or {}
     for name, over in search.space.items():
         lines.append(f"  {name} = {over}" + (f" (the preset has {_number(usual[name])})" if usual else ""))
     if not usual:
         values = flatten(search.base)
         others = [
-            f"{n} = {_number(values[n])} is not in {o}" for n, o in search.space.items() if not o.holds(values[n])
+            f"{n} = {_number(values[n])} lies outside {o}" for n, o in search.space.items() if not o.holds(values[n])
         ]
         lines.append(f"No trial uses the preset's own values: {', '.join(others)}.")
     values = search.usual or {name: over.outermost[0] for name, over in search.space.items()}
-    what = "the first" if usual else "one"
-    lines.append(f"{what} of them: metrpo train {shlex.join(search.runs(0, values)[0].arguments)}")
+    what = "the first trial" if usual else "one trial"
+    lines.append(f"{what}: metrpo train {shlex.join(search.runs(0, values)[0].arguments)}")
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""A search over settings: which task, which settings over what, how many trials, and what a trial is worth."""
+"""A search over settings: its task, its settings and their ranges, the number of trials, and a trial's value."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ if TYPE_CHECKING:
 
 Pruner = Literal["median", "halving", "none"]
 LAST = 3
-"""Evaluations, one after each iteration, whose mean counts: one alone is noise."""
+"""Number of last evaluations whose mean counts (one per iteration): a single one is noisy."""
 OBJECTIVE = f"mean over the seeds of the mean return_real of the last {LAST} iterations"
 _NOT_SEARCHED = ("task", "preset", "system", "seed", "iterations", "real_steps")
-"""What all trials share: they have options of their own."""
+"""Settings that all trials share, because they have their own options."""
 
 
 @dataclass(frozen=True)
 class Search:
-    """What is searched.
+    """A search.
 
-    Raises `ConfigError` or `TaskError` for what cannot be run, before anything is: an unknown setting or task, an
-    impossible value at either end of a range or among the choices.
+    Raises `ConfigError` or `TaskError`, before anything runs, for an unknown setting or task, and for an impossible
+    value at either end of a range or among the choices.
     """
 
     task: str
     space: Mapping[str, Span]
-    """Dotted setting -> what it is searched over."""
+    """Dotted setting -> its range or choices."""
     system: System = "me-trpo"
     preset: Preset = "fast"
     seeds: tuple[int, ...] = (0, 1)
-    """Of every trial; it is worth their mean."""
+    """Seeds of every trial, whose value is their mean."""
     iterations: int | None = None
     real_steps: int | None = None
     """The budget of every run, one of the two; default: the preset's iterations."""
@@ -72,13 +72,13 @@ class Search:
         for name in (*self.space, *self.settings):
             if name in _NOT_SEARCHED or (name in self.space and name in self.settings):
                 twice = (
-                    "is to be fixed and searched" if name in self.space and name in self.settings else "has an option"
+                    "is both fixed and searched" if name in self.space and name in self.settings else "has an option"
                 )
                 raise ConfigError(f"tune: expected settings of a run, each once, got {name}, which {twice}")
         if "collect.steps" in self.space and self.pruner != "none":
             raise ConfigError(
-                "collect.steps: expected iterations of one length, for pruning compares trials after as many of them, "
-                "got it among what is searched; add --pruner none, and --real-steps, so that all cost the same"
+                "collect.steps: expected a fixed value, because pruning compares trials iteration by iteration, got a "
+                "searched one; add --pruner none, and --real-steps, so that all trials cost the same"
             )
         object.__setattr__(self, "task", self._task().name)
         for name, over in self.space.items():
@@ -98,15 +98,15 @@ class Search:
     @property
     def _fixed(self) -> tuple[tuple[str, Any], ...]:
         budget = {"iterations": self.iterations, "real_steps": self.real_steps}
-        given = {name: value for name, value in budget.items() if value is not None} | dict(self.settings)
-        return tuple((name, tuple(v) if isinstance(v, list) else v) for name, v in given.items())
+        fixed = {name: value for name, value in budget.items() if value is not None} | dict(self.settings)
+        return tuple((name, tuple(v) if isinstance(v, list) else v) for name, v in fixed.items())
 
     @property
     def usual(self) -> dict[str, Any] | None:
-        """The searched settings as the preset has them; None when one is not among what is searched."""
+        """The preset's values of the searched settings; None when one lies outside the search."""
         values = flatten(self.base)
-        found = {name: values[name] for name in self.space}
-        return found if all(self.space[name].holds(value) for name, value in found.items()) else None
+        searched = {name: values[name] for name in self.space}
+        return searched if all(self.space[name].holds(value) for name, value in searched.items()) else None
 
     def runs(self, number: int, values: Mapping[str, Any]) -> list[RunSpec]:
         """The runs of trial `number`, one for each seed."""
@@ -125,10 +125,10 @@ class Search:
         return budget.spent(self.base, rows)
 
     def record(self) -> dict[str, Any]:
-        """What makes two searches the same, as JSON; more trials make no other one."""
-        found = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "trials"}
+        """The search as JSON, without the number of trials: equal records mean the same search."""
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name != "trials"}
         settings = {name: list(v) if isinstance(v, tuple) else v for name, v in self.settings.items()}
-        return found | {
+        return fields | {
             "space": {name: str(over) for name, over in self.space.items()},
             "seeds": list(self.seeds),
             "settings": settings,
@@ -136,12 +136,12 @@ class Search:
 
 
 def worth(returns: Sequence[Sequence[Row]], iterations: int | None = None) -> list[float]:
-    """What the seeds' runs earn after so many iterations (None: all of each): `OBJECTIVE` is the mean of these."""
-    found = []
+    """The value of each seed's run after `iterations` (None: all): `OBJECTIVE` is the mean of these."""
+    values = []
     for rows in returns:
         last = [row.get("return_real") for row in rows[:iterations][-LAST:]]
-        found.append(math.fsum(numbers(last)) / len(last))
-    return found
+        values.append(math.fsum(numbers(last)) / len(last))
+    return values
 
 
 def from_file(path: Path) -> Search:

@@ -1,4 +1,4 @@
-"""What a setting is searched over: a range of numbers or a few choices, as typed and as Optuna asks for it."""
+"""The range or the choices of a searched setting, as typed and for Optuna."""
 
 from __future__ import annotations
 
@@ -128,23 +128,23 @@ def span(name: str, values: Any) -> Span:
 
 
 def _range(name: str, kind: Any, text: str) -> Range:
-    found = _RANGE.fullmatch(text.strip())
-    if found is None:
+    match = _RANGE.fullmatch(text.strip())
+    if match is None:
         raise ConfigError(f"search: {name}: expected {_FORMS}; got {text!r}")
     if kind not in (int, float):
         raise ConfigError(
-            f"search: {name}: expected choices, for it is no number (see: metrpo train --help-all); got {text!r}"
+            f"search: {name}: expected choices, because it is no number (see: metrpo train --help-all); got {text!r}"
         )
     try:
-        low, high = kind(found["low"]), kind(found["high"])
-        step = kind(found["step"]) if found["step"] else None
+        low, high = kind(match["low"]), kind(match["high"])
+        step = kind(match["step"]) if match["step"] else None
     except ValueError:
         raise ConfigError(f"search: {name}: expected whole numbers, got {text!r}") from None
     if not -math.inf < low < high < math.inf:
         raise ConfigError(f"search: {name}: expected two finite numbers, the lower one first, got {text!r}")
-    if found["log"] and (low <= 0 or step):
+    if match["log"] and (low <= 0 or step):
         raise ConfigError(f"search: {name}: expected log of numbers above 0 and without a step, got {text!r}")
-    result = Range(low, high, bool(found["log"]), step)
+    result = Range(low, high, bool(match["log"]), step)
     if step is not None and (step <= 0 or not result.holds(high)):
         raise ConfigError(f"search: {name}: expected a whole number of steps from {low} to {high}, got {text!r}")
     return result

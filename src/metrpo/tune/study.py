@@ -28,15 +28,15 @@ if TYPE_CHECKING:
 FILE = "study.jsonl"
 _NAME, _SPEC = "metrpo", "search"
 _RANDOM = 6
-"""Trials that are drawn at random, the preset's own among them, before the sampler begins to learn from them."""
+"""Number of random trials, the preset's own included, before the sampler learns from them."""
 _UNPRUNED = 4
-"""Trials that have to be complete before one is held against them."""
+"""Number of complete trials before others are compared with them."""
 _FACTOR = 3
 """Successive halving lets the best third go on."""
 
 
 def require_optuna() -> None:
-    """Raises `MetrpoError` where Optuna is not installed; silences what it would print of itself."""
+    """Raises `MetrpoError` where Optuna is not installed; silences its own messages."""
     try:
         import optuna
     except ImportError as error:
@@ -56,7 +56,7 @@ class _Held:
 
 @contextmanager
 def opened_study(search: Search, out: Path) -> Iterator[Study]:
-    """The study of `search` in `out`, begun or gone on with; held by this process in the `with` block.
+    """The study of `search` in `out`, new or resumed; locked by this process in the `with` block.
 
     Raises `RunDirectoryError` when `out` cannot be written, is in use, is damaged or holds another search, and
     `MetrpoError` where Optuna is missing.
@@ -71,7 +71,7 @@ def opened_study(search: Search, out: Path) -> Iterator[Study]:
         study = _load(out / FILE, search)
         _require_same(study.user_attrs.get(_SPEC), search, out)
         if not study.get_trials(deepcopy=False) and search.usual is not None:
-            _enqueue(study, search, search.usual)  # what all others are held against
+            _enqueue(study, search, search.usual)  # the one to compare all others with
         yield study
 
 
@@ -119,7 +119,7 @@ def _pruner(search: Search) -> BasePruner:
     from optuna.pruners import MedianPruner, NopPruner, SuccessiveHalvingPruner
 
     first = max(1, -(-search.steps // 3))
-    """The first third of a run says little: the models have seen next to nothing."""
+    """The first third of a run says little: the models have seen little data."""
     if search.pruner == "median":
         return MedianPruner(n_startup_trials=_UNPRUNED, n_warmup_steps=first)
     return SuccessiveHalvingPruner(first, _FACTOR) if search.pruner == "halving" else NopPruner()
@@ -167,10 +167,10 @@ def _repair(path: Path) -> None:
 def _require_same(stored: Any, search: Search, out: Path) -> None:
     ours: Mapping[str, Any] = json.loads(json.dumps(search.record()))
     if not isinstance(stored, dict):
-        raise RunDirectoryError(f"{out / FILE} is no search of metrpo: choose another --out")
+        raise RunDirectoryError(f"{out / FILE} is no search of metrpo; choose another --out")
     other = [f"{name} {stored.get(name)} (now {value})" for name, value in ours.items() if stored.get(name) != value]
     if other:
         raise RunDirectoryError(
-            f"{out} holds another search: {'; '.join(other)}. Give the same again (only trials and jobs may change), "
+            f"{out} holds another search: {'; '.join(other)}. Give the same search (only trials and jobs may change), "
             "or choose another --out"
         )

@@ -31,23 +31,23 @@ if TYPE_CHECKING:
 _POLL = 0.5
 """Seconds between two looks at the runs."""
 _HOPELESS = 3
-"""Failures in a session before anything goes well, after which no further trial is begun."""
+"""Failures without a success in a session, after which no trial is started."""
 
 
 @dataclass
 class _Going:
-    """A trial that is under way."""
+    """A running trial."""
 
     trial: Trial
     runs: list[RunSpec]
     workers: dict[RunSpec, Worker]
     cores: list[Cores]
     reported: int
-    """Iterations that stand in the study."""
+    """Iterations in the study."""
     judged: int
     """Iterations after which it was asked whether the trial is bad: one less, where the process ended in between."""
     pruned: int | None
-    """The iteration after which it was found bad."""
+    """The iteration after which it was pruned."""
     ending: bool = False
     began: float = field(default_factory=time.monotonic)
 
@@ -59,10 +59,10 @@ class _Going:
 
 
 def tune(search: Search, out: Path, jobs: int, tell: Tell, begin: Begin = begin) -> Tuned:
-    """Makes trials, `jobs` at a time and each on cores of its own, until there are as many as asked for.
+    """Runs trials, `jobs` at a time and each on its own cores, until there are as many as the search asks for.
 
-    Returns what all trials under `out` have given. Started anew it goes on: finished trials are kept, those under way
-    are resumed. Ctrl-C or SIGTERM stops the runs too, each with its iteration saved; once more stops them at once.
+    Returns all trials under `out`. Started again, it keeps finished trials and resumes the others. Ctrl-C or SIGTERM
+    stops the runs too, each with its iteration saved; a second one stops them at once.
 
     Raises `MetrpoError` when `out` cannot be used (see `opened_study`), or when the first trials all fail.
     """
@@ -72,7 +72,7 @@ def tune(search: Search, out: Path, jobs: int, tell: Tell, begin: Begin = begin)
 
 
 class _Tuning:
-    """One session: what is under way, and what becomes of it."""
+    """One session of a search."""
 
     def __init__(self, search: Search, study: Study, out: Path, jobs: int, tell: Tell, begin: Begin) -> None:
         self._search, self._study, self._out, self._tell, self._begin = search, study, out, tell, begin
@@ -83,14 +83,15 @@ class _Tuning:
         self._failed, self._hopeful = 0, any(t.state.name == "COMPLETE" for t in study.get_trials(deepcopy=False))
 
     def run(self) -> None:
-        of = [trial.state.name for trial in self._study.get_trials(deepcopy=False)]
-        broken_off = [number for number, state in enumerate(of) if state == "RUNNING"]
-        done = len(of) - len(broken_off) - of.count("WAITING")
-        self._tell(f"{done} of {counted(self._search.trials, 'trial')} are finished, {len(broken_off)} broken off")
+        states = [trial.state.name for trial in self._study.get_trials(deepcopy=False)]
+        interrupted = [number for number, state in enumerate(states) if state == "RUNNING"]
+        finished = len(states) - len(interrupted) - states.count("WAITING")
+        trials = counted(self._search.trials, "trial")
+        self._tell(f"{finished} of {trials} are finished, {len(interrupted)} interrupted")
         try:
             while True:
-                while self._free and (broken_off or self._wants_more()):
-                    self._start(broken_off.pop(0) if broken_off else None)
+                while self._free and (interrupted or self._wants_more()):
+                    self._start(interrupted.pop(0) if interrupted else None)
                 if not self._going:
                     break
                 time.sleep(_POLL)
@@ -100,13 +101,13 @@ class _Tuning:
             self._stop_all()
         if self._is_hopeless():
             raise MetrpoError(
-                f"{self._failed} trials have failed and none went well: mend what the end of their logs says, then "
+                f"{self._failed} trials have failed and none succeeded; fix the error at the end of their logs, then "
                 "give the same command again"
             )
 
     def _wants_more(self) -> bool:
-        made = sum(t.state.name != "WAITING" for t in self._study.get_trials(deepcopy=False))
-        return made < self._search.trials and not self._is_hopeless()
+        started = sum(t.state.name != "WAITING" for t in self._study.get_trials(deepcopy=False))
+        return started < self._search.trials and not self._is_hopeless()
 
     def _is_hopeless(self) -> bool:
         return self._failed >= _HOPELESS and not self._hopeful
@@ -150,16 +151,16 @@ class _Tuning:
             self._going.remove(going)
             self._free.append(going.cores)
             self._finish(going)
-        elif any(codes.values()) and not going.ending:  # a seed has failed, which the others cannot mend
+        elif any(codes.values()) and not going.ending:  # one seed failed, so the trial has failed
             going.stop()
 
     def _rows(self, going: _Going) -> tuple[list[list[Row]], bool]:
-        """What the trial's runs have measured, and whether that is all."""
+        """The rows of the trial's runs, and whether they are complete."""
         rows = [rows_of(run, self._out) for run in going.runs]
         return rows, all(map(self._search.is_spent, rows))
 
     def _report(self, going: _Going) -> None:
-        """Tells the pruner of the iterations that all seeds have finished, and stops the trial if they are bad."""
+        """Reports iterations that all seeds have finished to the pruner, and stops the trial if they are bad."""
         if going.pruned is not None:
             return
         rows, whole = self._rows(going)
@@ -201,7 +202,7 @@ class _Tuning:
             self._tell(f"trial {trial.number}: FAILED after {took}: {why}")
 
     def _why(self, going: _Going) -> str:
-        """The last words of the run that failed, rather than of one that was stopped for that."""
+        """The end of the log of the run that failed, not of one that was stopped for that."""
         codes = {run: worker.poll() for run, worker in going.workers.items()}
         short = [run for run in codes if not self._search.is_spent(rows_of(run, self._out))] or list(codes)
         run = next((run for run in short if codes[run] != 128 + signal.SIGTERM), short[0])
@@ -210,10 +211,10 @@ class _Tuning:
         return "\n      ".join([f"exit code {codes[run]}; the end of {log}:", *lines])
 
     def _stop_all(self) -> None:
-        """Ends what is under way: each run finishes its iteration, and when this is interrupted is asked once more."""
+        """Stops the running trials: each run finishes its iteration. When interrupted, stops them at once."""
         if self._going:
             trials = counted(len(self._going), "trial")
-            self._tell(f"stopping {trials} at the end of an iteration; once more stops them at once")
+            self._tell(f"stopping {trials} at the end of an iteration; press again to stop at once")
         try:
             self._end_all()
         except BaseException:

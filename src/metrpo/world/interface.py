@@ -1,4 +1,4 @@
-"""What a task's environment shows and takes, part by part, for those who use a policy without metrpo."""
+"""The layout of a task's observations and actions, for users of a policy without metrpo."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Interface:
     """The layout of a task's states, and its environment's own range of actions."""
 
     observation: tuple[tuple[int, str], ...]
-    """The parts of a state, in order: how many numbers, and what they are."""
+    """The parts of a state, in order: size and description."""
     action_low: tuple[float, ...]
-    """[A], what the environment takes for an action of -1."""
+    """[A], the environment's action for -1."""
     action_high: tuple[float, ...]
-    """[A], what it takes for an action of 1."""
+    """[A], the environment's action for 1."""
 
 
 def of_env(env: gymnasium.Env[Any, Any], name: str) -> Interface:

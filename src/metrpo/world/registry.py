@@ -24,7 +24,7 @@ _TASKS: dict[str, Task] = {}
 
 
 def register(task: Task) -> Task:
-    """Makes `task` known by its name."""
+    """Registers `task` under its name."""
     _TASKS[task.name] = task
     return task
 
@@ -35,12 +35,13 @@ def tasks() -> dict[str, Task]:
 
 
 def get_task(name: str, env_kwargs: Iterable[str] | Mapping[str, Any] = (), imports: Iterable[str] = ()) -> Task:
-    """The task of that name: a registered one (case does not matter), one that comes with its formulas
-    (`metrpo.world.tasks.gymnasium_formulas`), or what `metrpo.world.resolve` makes of it.
+    """The task of that name: a registered one (in upper or lower case), one with formulas
+    (`metrpo.world.tasks.gymnasium_formulas`), or what `metrpo.world.resolve` finds.
 
-    Its environment is made with `env_kwargs`, a dict or texts KEY=VALUE; `imports` are modules that are imported first.
+    `env_kwargs`, a dict or strings KEY=VALUE, are its environment's keyword arguments; `imports` are modules to import
+    first.
 
-    Raises `TaskError` with the nearest names when there is none, and when an environment cannot be used.
+    Raises `TaskError` with the nearest names when there is none, and when its environment cannot be used.
     """
     for module in imports:
         import_module(module)
@@ -63,7 +64,7 @@ def get_task(name: str, env_kwargs: Iterable[str] | Mapping[str, Any] = (), impo
 
 
 def task_for(config: Config) -> Task:
-    """The config's task, its formulas left out where they are to be learned; asked for once, and then passed on.
+    """The config's task, without the formulas that are to be learned; looked up once, and then passed on.
 
     Raises `TaskError` as `get_task`, `ConfigError` for a history that is too long.
     """
@@ -74,13 +75,13 @@ def task_for(config: Config) -> Task:
 
 @cache
 def limited(task: Task, limits: Limits) -> Task:
-    """The task in which every policy is held to `limits`; the same object every time."""
+    """The task with `limits` on every policy's actions; the same object every time."""
     return task if task.limits == limits else dataclasses.replace(task, limits=limits)
 
 
 @cache
 def without_formulas(task: Task) -> Task:
-    """The task with reward and end of episode to be learned; the same object every time."""
+    """The task with a learned reward and end of episodes; the same object every time."""
     return dataclasses.replace(task, reward=None, terminated="learned")
 
 

@@ -19,14 +19,14 @@ from metrpo.world.size_limits import require_horizon, require_size
 
 @dataclass(frozen=True)
 class Task:
-    """What the learner may know of the real system: everything but its dynamics."""
+    """What the learner may know of the real system: all but its dynamics."""
 
     name: str
     """As typed on the command line, "Swimmer"."""
     env_id: str | None
-    """Gymnasium id, "metrpo/Swimmer-v0"; None, and no `make`: only another program can play it (see `metrpo init`)."""
+    """Gymnasium id, "metrpo/Swimmer-v0"; None, without `make`: only another program plays it (see `metrpo init`)."""
     state_size: int
-    """S; with a history, of all that a state holds."""
+    """S, with the history."""
     action_size: int
     """A; actions lie in [-1, 1]."""
     horizon: int
@@ -42,12 +42,12 @@ class Task:
     make: Callable[..., gymnasium.Env] | None = None
     """Makes the environment, in place of `gymnasium.make(env_id)`."""
     interface: Interface | None = None
-    """What the environment shows and takes, as a policy's file says it; None: unknown."""
+    """The layout of observations and actions, for a policy's file; None: unknown."""
     limits: Limits = NONE
-    """What actions every policy is held to."""
+    """Limits on every policy's actions."""
     history: int = 1
-    """N, the observations that a state holds, with the N-1 actions between them (`metrpo.history`). The setting makes
-    it (`world.history_env`): a task of one's own leaves it at 1."""
+    """N, the observations that a state holds, with the N-1 actions between them (`metrpo.history`). The setting
+    `history` changes it (`world.history_env`): leave it at 1 in your own tasks."""
 
     def __post_init__(self) -> None:
         require_size(self.name, self.state_size)
@@ -59,7 +59,7 @@ class Task:
 
     @property
     def layout(self) -> History:
-        """How states are put together out of observations and actions."""
+        """How states are composed of observations and actions."""
         return History.of_state(self.history, self.state_size, self.action_size)
 
     @property
@@ -69,7 +69,7 @@ class Task:
 
     @property
     def carried(self) -> tuple[int, ...]:
-        """[S - O], where what models need not predict of the next state stands in state and action, [S + A]."""
+        """[S - O], indices into state and action, [S + A], of what models need not predict of the next state."""
         return self.layout.carried
 
     @property
@@ -92,9 +92,9 @@ class Task:
 
         Raises `TaskError` when there is none, and for wrappers with running statistics (`world.env_wrapper`).
         """
-        made = self._made(**kwargs)
-        refuse_running_statistics(made, self.name)
-        return made
+        env = self._made(**kwargs)
+        refuse_running_statistics(env, self.name)
+        return env
 
     def _made(self, **kwargs: Any) -> gymnasium.Env:
         if self.make is not None:
