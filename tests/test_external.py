@@ -137,7 +137,7 @@ def test_a_damaged_checkpoint_costs_no_real_episode(uninterrupted, tmp_path, cap
     monkeypatch.setattr("metrpo.world.collection.play", nobody)
     train(config(), tmp_path)
     assert "iteration-00002.npz is damaged" in caplog.text
-    assert "going on from iteration-00001.npz" in caplog.text
+    assert "resuming from iteration-00001.npz" in caplog.text
     assert result(tmp_path) == result(uninterrupted)
 
 

@@ -205,7 +205,7 @@ def trial(real, damages):
         path = run_dir / name
         if path.is_dir():
             assert name == "curve.png", "what cannot be written is an error, but for a picture"
-            assert "no learning curve from here on" in told
+            assert "no learning curve any more" in told
         else:
             assert path.read_bytes() == content, f"{name} was not written anew"
     if "TensorBoard" not in told:

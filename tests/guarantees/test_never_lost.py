@@ -273,7 +273,7 @@ def test_what_cannot_go_on_does_not_say_so(tmp_path, taught, monkeypatch, capsys
     err = capsys.readouterr().err
     assert "expected an environment, got none" in err
     assert "expected an .npz of states" in err
-    assert "goes on" not in err
+    assert "command resumes" not in err
 
 
 # ---------------------------------------------------------------- time

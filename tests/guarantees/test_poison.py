@@ -355,7 +355,7 @@ def test_a_member_that_diverges_at_once_is_made_anew(clean, monkeypatch, caplog,
     Blocks(monkeypatch, 2, value, lambda block: block == 1)
     ensemble, info = second_fit(clean)
     assert (info.resets, sound(ensemble)) == (1, True)
-    assert "fit, iteration 2: members 2 diverged: re-initialised" in caplog.text
+    assert "fit, iteration 2: members 2 diverged; re-initialised" in caplog.text
     assert same(only(ensemble.networks, [0, 1]), only(clean.fits[1][0].networks, [0, 1]))
 
 
@@ -387,7 +387,7 @@ def test_a_member_that_diverges_again_ends_the_run_by_name(clean, tmp_path, monk
 def test_a_learning_rate_far_too_large_is_said_so(tmp_path):
     config = override(TINY, {"fit.learning_rate": 1e30})
     with pytest.raises(
-        DivergedError, match=r"^fit, iteration 1: members 0, 1, 2: .* lower fit\.learning_rate than 1e\+30"
+        DivergedError, match=r"^fit, iteration 1: members 0, 1, 2: .* fit\.learning_rate below 1e\+30"
     ):
         train(config, tmp_path)
     assert iterations_on_disk(tmp_path) == 0

@@ -117,7 +117,7 @@ def test_in_the_last_evaluation_nothing_goes_on(tmp_path, expected, monkeypatch,
         send(patch, signal.SIGTERM, 1, tiny_run.ITERATIONS, "evaluate")
         assert main.main(command_line(run_dir)) == 143
     err = capfd.readouterr().err
-    assert "goes on" not in err
+    assert "command resumes" not in err
     command = shlex.join(["metrpo", *command_line(run_dir)])
     again = f"The same command would only write the files that are missing, such as the video.\n\n  {command}\n"
     assert f"metrpo: stopped; {run_dir} is complete: nothing is lost. {again}" in err

@@ -373,7 +373,7 @@ def test_a_damaged_checkpoint_costs_its_iteration_only(tmp_path, caplog):
     damaged = newest.read_bytes()
     assert train(tmp_path, until=4) == [3, 4]
     assert "iteration-00003.npz is damaged" in caplog.text
-    assert "going on from iteration-00002.npz" in caplog.text
+    assert "resuming from iteration-00002.npz" in caplog.text
     assert newest.with_name("iteration-00003.npz.damaged").read_bytes() == damaged, "nothing is thrown away"
     assert [row["iteration"] for row in read_metrics(tmp_path / "metrics.csv")] == [1, 2, 3, 4]
 

@@ -360,7 +360,7 @@ def test_ctrl_c_stops_the_runs_and_the_same_command_goes_on(tmp_path):
     assert told[-1] == "stopping 1 trial at the end of an iteration; press again to stop at once"
     told.clear()
     assert outcome(tune(search(), tmp_path / "broken", 1, told.append, fake)) == expected
-    assert told[0] == "1 of 8 trials are finished, 1 broken off"
+    assert told[0] == "1 of 8 trials are finished, 1 interrupted"
 
 
 def test_a_trial_that_fails_stops_its_seeds_and_no_other_trial(tmp_path):
