@@ -144,7 +144,7 @@ def test_a_task_out_of_a_module(file, monkeypatch):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("{file}:nothing", "mine.py has no 'nothing'"),
+        ("{file}:nothing", "mine.py neither defines nor registers 'nothing'"),
         ("{file}:number", "expected a metrpo.Task or a function that creates an environment, got 7"),
         ("nowhere.py:task", "expected a Python file at .*nowhere.py, found none"),
         ("no_such_module:task", "expected a module no_such_module .* found none"),
@@ -185,7 +185,7 @@ BROKEN = {
         broken(step=lambda self, a: (np.zeros(3, np.float32), np.zeros(2), False, False, {})),
         "expected one finite number as reward, got array",
     ),
-    "an exception in step": (broken(step=raising), r"Mine: step\(\) raised ValueError: motor 3 is off; make the env"),
+    "an exception in step": (broken(step=raising), r"Mine: step\(\) raised ValueError: motor 3 is off; first make the env"),
     "an exception in reset": (broken(reset=raising), r"Mine: reset\(\) raised TypeError"),
     "an observation out of its space's shape": (
         broken(observation=lambda self: np.zeros(4, np.float32)),
