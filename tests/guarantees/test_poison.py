@@ -386,9 +386,7 @@ def test_a_member_that_diverges_again_ends_the_run_by_name(clean, tmp_path, monk
 
 def test_a_learning_rate_far_too_large_is_said_so(tmp_path):
     config = override(TINY, {"fit.learning_rate": 1e30})
-    with pytest.raises(
-        DivergedError, match=r"^fit, iteration 1: members 0, 1, 2: .* fit\.learning_rate below 1e\+30"
-    ):
+    with pytest.raises(DivergedError, match=r"^fit, iteration 1: members 0, 1, 2: .* fit\.learning_rate below 1e\+30"):
         train(config, tmp_path)
     assert iterations_on_disk(tmp_path) == 0
     assert len(list(tmp_path.glob("episodes/*.npz"))) == 4, "real episodes are kept"

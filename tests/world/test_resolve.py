@@ -185,7 +185,7 @@ BROKEN = {
         broken(step=lambda self, a: (np.zeros(3, np.float32), np.zeros(2), False, False, {})),
         "expected one finite number as reward, got array",
     ),
-    "an exception in step": (broken(step=raising), r"Mine: step\(\) raised ValueError: motor 3 is off; first make the env"),
+    "an exception in step": (broken(step=raising), r"Mine: step\(\) raised ValueError: motor 3 is off; first make"),
     "an exception in reset": (broken(reset=raising), r"Mine: reset\(\) raised TypeError"),
     "an observation out of its space's shape": (
         broken(observation=lambda self: np.zeros(4, np.float32)),
