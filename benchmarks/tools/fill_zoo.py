@@ -23,7 +23,7 @@ from metrpo.policy.gaussian import Policy
 from metrpo.run.card import card_of
 from metrpo.run.files import folder_name, read_arrays
 from metrpo.run.find import SeenRun, find
-from metrpo.run.policy_file import FILE, save_policy
+from metrpo.run.policy_file import FILE, Learned, save_policy
 from metrpo.world.registry import task_for
 
 RESULTS = Path(__file__).resolve().parents[2] / "results"
@@ -53,9 +53,9 @@ def add(runs: list[SeenRun], floor: float | None, folder: Path) -> None:
     layers = tuple((arrays[f"w{i}"], arrays[f"b{i}"]) for i in range(len(info.hidden) + 1))
     policy, task = Policy(layers, arrays["log_std"]), task_for(best.config)
     folder.mkdir(parents=True)
-    numbers = (info.iteration, info.real_steps, info.return_real)
+    learned = Learned(info.iteration, info.real_steps, info.return_real)
     origin = arrays.get("origin")
-    save_policy(folder, policy, info.task, *numbers, task.interface, origin, best.config)  # type: ignore[arg-type]
+    save_policy(folder, policy, info.task, learned, task.interface, origin, best.config)  # type: ignore[arg-type]
     chosen = {"chosen_of": len(runs), "mean_of_runs": float(np.mean([_return(run) for run in runs]))}
     card = {**card_of(best), "no_skill": floor, **chosen, "run": _name_of(best.path)}
     (folder / zoo.CARD).write_text(json.dumps(card, indent=1) + "\n", "utf-8")

@@ -15,7 +15,7 @@ from metrpo.commands.command_table import COMMANDS
 
 def overview() -> str:
     """All commands, within 24 lines of 80 columns."""
-    lines = ["usage: metrpo COMMAND [OPTIONS]     control learned from few real steps (ME-TRPO)", ""]
+    lines = ["usage: metrpo COMMAND [OPTIONS]    control learned from few real steps (ME-TRPO)", ""]
     for purpose, commands in COMMANDS.items():
         for i, (name, text) in enumerate(commands.items()):
             lines.append(f"{purpose if i == 0 else '':<14}{name:<11}{text}")

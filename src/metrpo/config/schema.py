@@ -26,8 +26,8 @@ class CollectConfig:
     std_per: Literal["episode", "step"] = "episode"
     """How often to draw that standard deviation: once an episode (the paper) or at every step (authors' code)."""
     noise_correlation: float = 0.0
-    """Correlation of the noise from one step to the next, at least 0 and below 1: with 0 each step's noise is
-    independent (the paper); with 0.9 it keeps its direction for some ten steps, and so moves a body further."""
+    """Correlation of the noise from one step to the next, at least 0 and below 1. 0: independent noise at each step
+    (the paper); 0.9: noise that keeps its direction for some ten steps, and so moves a body further."""
     parameter_noise: float = 3.0
     """Scale of the parameter noise: std = scale * |policy - previous policy|, redrawn every episode; 0: none."""
     validation_fraction: float = 1 / 3
