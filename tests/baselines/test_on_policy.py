@@ -139,7 +139,7 @@ def path_of(rng, weights, bias, std, steps, start=None):
     drawn, states = np.array(drawn), np.array(states)
     assert np.abs(drawn).max() < 1
     rewards = probe.reward(states[:-1], drawn, states[1:])
-    path = value_gradients.Path(states, drawn, rewards, np.ones(steps))
+    path = value_gradients.RealPath(states, drawn, rewards, np.ones(steps))
     return jax.tree.map(lambda x: np.asarray(x, np.float32), path), noise
 
 

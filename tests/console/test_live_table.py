@@ -375,7 +375,7 @@ def test_plot_names_what_it_leaves_out(tmp_path, capsys, caplog):
     a_run(tmp_path / "runs/a")
     a_run(tmp_path / "runs/b").joinpath("metrics.csv").write_text("x")
     assert main(["plot", "runs"]) == 0
-    assert "left out runs/b" in caplog.text
+    assert "skipped runs/b" in caplog.text
 
 
 def test_a_mean_curve_is_where_all_seeds_are(tmp_path):

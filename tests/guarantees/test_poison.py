@@ -375,7 +375,7 @@ def test_a_member_that_diverges_again_ends_the_run_by_name(clean, tmp_path, monk
     block_count = 2 * TINY.fit.max_passes // TINY.fit.validate_every
     Blocks(monkeypatch, 0, math.nan, lambda block: block > block_count // 2)
     with pytest.raises(
-        DivergedError, match=r"^fit, iteration 2: members 0: expected finite .* lower fit\.learning_rate"
+        DivergedError, match=r"^fit, iteration 2: members 0: expected finite .* start anew with fit\.learning_rate"
     ):
         train(TINY, tmp_path)
     assert iterations_on_disk(tmp_path) == 1

@@ -317,7 +317,7 @@ def test_an_imported_id_with_arguments_is_rebuilt_from_anywhere(tmp_path, tilted
     forgotten(monkeypatch, "tilting")
     gymnasium.registry.pop("Tilted-v0")
     made = []
-    monkeypatch.setattr("metrpo.evaluation.collect.evaluate", lambda task, *_: made.append(task) or np.zeros(1))
+    monkeypatch.setattr("metrpo.evaluation.batch_episodes.evaluate", lambda task, *_: made.append(task) or np.zeros(1))
     assert evaluated(capsys, "run") == (0, "Tilted-v0")
     assert gravity(made[0]) == 2.5
     monkeypatch.setattr("metrpo.evaluation.record", lambda make_env, *_: made.append(make_env.__self__) or tmp_path)
@@ -335,7 +335,7 @@ def test_a_file_that_moved_keeps_its_arguments(tmp_path, tilted, monkeypatch, ca
     monkeypatch.setattr(resolve, "_PLACES", {})
     gymnasium.registry.pop("Tilted-v0")  # the file registers it once more from its new place
     made = []
-    monkeypatch.setattr("metrpo.evaluation.collect.evaluate", lambda task, *_: made.append(task) or np.zeros(1))
+    monkeypatch.setattr("metrpo.evaluation.batch_episodes.evaluate", lambda task, *_: made.append(task) or np.zeros(1))
     assert evaluated(capsys, "run", "--task", "moved/tilting.py:tilted") == (0, "moved/tilting.py:tilted")
     assert evaluated(capsys, "run", "--task", "Pendulum-v1")[0] == 0
     assert list(map(gravity, made)) == [3.5, 10.0]

@@ -78,6 +78,18 @@ def test_one_std_per_episode_is_a_power_of_a_uniform_draw(power):
     assert abs(np.corrcoef(z[:-1, 0], z[1:, 0])[0, 1]) < 0.03
 
 
+@pytest.mark.parametrize("std_per", ["episode", "step"])
+def test_independent_noise_is_drawn_in_the_order_of_old_runs(std_per):
+    """A standard deviation, then the noise of its steps: a run from before any other setting resumes as it was."""
+    act = real.explore(ZERO, CollectConfig(max_std=2.0, std_power=3.0, std_per=std_per), np.random.default_rng(3))
+    rng = np.random.default_rng(3)
+    width = 2.0 * rng.uniform() ** 3
+    for step in range(4):
+        if step and std_per == "step":
+            width = 2.0 * rng.uniform() ** 3
+        np.testing.assert_array_equal(act(np.zeros(2)), width * rng.standard_normal(2))
+
+
 def test_correlated_noise_is_as_strong_and_keeps_its_direction():
     """A first-order autoregressive process: the correlation k steps apart is that of one step to the power k."""
     episodes = collect(probe.LONG_PROBE, max_std=0.2, noise_correlation=0.8, steps=200 * 150)

@@ -62,7 +62,7 @@ def test_episodes_come_back_as_they_were_logged(tmp_path, task):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rewards": None}, "expected the arrays states, .*; it lacks rewards"),
+        ({"rewards": None}, "expected the arrays states, .*; rewards missing"),
         (
             {"states": np.zeros((600, 3))},
             r"states: expected numbers of shape \[600, 2\], got float64 of shape \[600, 3\]",

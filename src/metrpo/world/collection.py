@@ -153,12 +153,12 @@ def explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
     std, kept, last = stds(), config.noise_correlation, list[np.ndarray]()
 
     def act(state: np.ndarray) -> np.ndarray:
-        action = mean(state)
+        action, width = mean(state), next(std)  # drawn before the noise
         noise = rng.standard_normal(action.shape)
         if last:
             noise = kept * last.pop() + math.sqrt(1 - kept**2) * noise
         last.append(noise)
-        return action + next(std) * noise
+        return action + width * noise
 
     return act
 
