@@ -75,7 +75,7 @@ def test_formulas_are_held_against_an_environment_with_arguments():
     with contextlib.closing(get_task("Pendulum-v1", {"g": 5.0}).make_env()) as env:
         assert env._env.unwrapped.g == 5.0
     with_other = preset("Reacher-v5", env_kwargs={"reward_control_weight": 7.0})
-    with pytest.raises(TaskError, match="put it aside with --learn-reward"):
+    with pytest.raises(TaskError, match="learn it from data with --learn-reward"):
         training.check(with_other, get_task("Reacher-v5", with_other.env_kwargs))
     training.check(preset("Reacher-v5"), get_task("Reacher-v5"))
 

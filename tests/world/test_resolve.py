@@ -310,7 +310,10 @@ def test_a_right_formula_passes():
             r"of 1000 random transitions the largest difference is 0.00\d+ at number \d+, where the environment paid "
             r"-[\d.]+ and the formula says .*s = \[.*a = \[.*s' = \[.*--trust-reward",
         ),
-        (lambda: pendulum(lambda s, a, n: pendulum_reward(n, a, s)), "the reward's formula is not the environment's"),
+        (
+            lambda: pendulum(lambda s, a, n: pendulum_reward(n, a, s)),
+            "the reward formula disagrees with the environment",
+        ),
         (lambda: pendulum(lambda s, a, n: np.nan * s[..., 0]), "largest difference is inf"),
         (lambda: pendulum(lambda s, a, n: s), r"expected shape \[1000\], got \[1000, 3\]; sum over the last axis"),
         (lambda: pendulum(None, lambda s: s[..., 0] > 0.5), "did not end the episode, the formula says otherwise"),

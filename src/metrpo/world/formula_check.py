@@ -13,10 +13,7 @@ STEPS = 1000
 """Real steps that the check takes, with random actions."""
 TOLERANCE = 1e-3
 """Of 1 + |reward|: states are kept in float32."""
-_ADVICE = (
-    "Correct it, leave it out or put it aside with --learn-reward (it is then learned), or go on all the same with "
-    "--trust-reward"
-)
+_ADVICE = "Correct it, or learn it from data with --learn-reward; --trust-reward trains with it as it is"
 
 
 def check_formulas(task: Task, rng: np.random.Generator) -> None:
@@ -51,7 +48,7 @@ def _check_rewards(task: Task, episodes: list[Episode]) -> None:
     if np.any(off > TOLERANCE * (1 + np.abs(paid))):
         at = int(np.argmax(off))
         raise TaskError(
-            f"{task.name}: the reward's formula is not the environment's: of {len(paid)} random transitions the "
+            f"{task.name}: the reward formula disagrees with the environment: of {len(paid)} random transitions the "
             f"largest difference is {off[at]:.4g} at number {at}, where the environment paid {paid[at]:.6g} and the "
             f"formula says {said[at]:.6g}; s = {_row(newest(states[at]))}, a = {_row(actions[at])} (in [-1, 1]), "
             f"s' = {_row(newest(following[at]))}. {_ADVICE}"
@@ -66,7 +63,7 @@ def _check_ends(task: Task, episodes: list[Episode]) -> None:
     if said.shape != ended.shape or np.any(said != ended):
         at = int(np.argmax(said != ended)) if said.shape == ended.shape else 0
         raise TaskError(
-            f"{task.name}: the formula of termination is not the environment's: at random transition {at} of "
+            f"{task.name}: the termination formula disagrees with the environment: at random transition {at} of "
             f"{len(ended)} the environment {'ended' if ended[at] else 'did not end'} the episode, the formula says "
             f"otherwise; s' = {_row(task.layout.newest(following[at]))}. {_ADVICE}"
         )
