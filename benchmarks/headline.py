@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
-from summarise import ROOT
+from summarise import ROOT, no_skill
 
 from metrpo import read_metrics
 from metrpo.report.tables import markdown
@@ -31,7 +31,6 @@ def _row(task: str) -> tuple[str, ...] | None:
     if not last:
         return None
     returns = [float(row["return_real"] or np.nan) for row in last]
-    no_skill = json.loads((ROOT / "yardsticks.json").read_text())[task]
     file = ROOT / "ceilings" / f"{task}.json"
     ceiling = f"{json.loads(file.read_text())['best']['mean']:.0f}" if file.exists() else "not searched"
     return (
@@ -40,6 +39,6 @@ def _row(task: str) -> tuple[str, ...] | None:
         str(len(last)),
         f"{np.mean(returns):.1f}",
         f"{np.min(returns):.1f}",
-        *(f"{no_skill[way]['mean']:.1f}" for way in ("zero", "random")),
+        *no_skill(task),
         ceiling,
     )

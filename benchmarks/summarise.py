@@ -49,16 +49,15 @@ def row(system: Path) -> tuple[str, ...]:
         f"{min(run[-1]['real_steps'] for run in runs):,}",
         over_seeds(last),
         over_seeds([float(np.min(last))]),
-        *_no_skill(system),
+        *no_skill(json.loads(next(system.glob("seed-*/config.json")).read_text())["task"]),
         over_seeds([float(np.fmax.reduce([_value(r, "return_real") for r in run])) for run in runs]),
         over_seeds([_value(run[-1], "gap") for run in runs]),
         over_seeds([_value(run[-1], "wall_seconds") / 60 for run in runs]),
     )
 
 
-def _no_skill(system: Path) -> tuple[str, str]:
-    """What doing nothing and random actions earn on its task."""
-    task = json.loads(next(system.glob("seed-*/config.json")).read_text())["task"]
+def no_skill(task: str) -> tuple[str, str]:
+    """What doing nothing and random actions earn, as cells; "-": not measured."""
     known = json.loads((ROOT / "yardsticks.json").read_text()).get(task, {})
     zero, drawn = (f"{known[way]['mean']:.1f}" if way in known else "-" for way in ("zero", "random"))
     return zero, drawn

@@ -34,11 +34,49 @@ def _bold(
 IMPROVERS["bold"] = _by_score_function(_bold)
 """
 
+GREET = """
+from dataclasses import dataclass
+
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class Greet:
+    whom: Positional[str]
+
+
+def run(command):
+    print(f"hello {command.whom}")
+    return 0
+"""
+
+
+def scratch_copy(folder: Path) -> Path:
+    """The package, copied into a folder that PYTHONPATH may name."""
+    package = folder / "metrpo"
+    shutil.copytree(Path(metrpo.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    return package
+
+
+def test_a_new_command_is_one_file_and_one_row(tmp_path):
+    """Nothing else has to know of it."""
+    package = scratch_copy(tmp_path)
+    (package / "commands" / "greet.py").write_text(GREET)
+    table = package / "commands" / "command_table.py"
+    table.write_text(table.read_text().replace('        "doctor":', '        "greet": "Say hello",\n        "doctor":'))
+
+    def run_there(*words: str) -> str:
+        environment = os.environ | {"PYTHONPATH": str(tmp_path)}
+        command = [sys.executable, "-m", "metrpo", *words]
+        return subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
+
+    assert "greet      Say hello" in run_there("--help")
+    assert run_there("greet", "you") == "hello you\n"
+
 
 def test_a_new_sampling_and_a_new_improver_are_a_row_and_a_name_each(tmp_path):
     """In a scratch copy of the package: they run by name, and the files that change are these three."""
-    package = tmp_path / "metrpo"
-    shutil.copytree(Path(metrpo.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
+    package = scratch_copy(tmp_path)
     for name, text in (("model/sampling.py", SAMPLING), ("policy/improvers/improver_table.py", IMPROVER)):
         (package / name).write_text((package / name).read_text() + text)
     schema = package / "config" / "schema.py"

@@ -4,7 +4,6 @@ import dataclasses
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -371,40 +370,6 @@ def test_the_list_of_commands_fits_a_screen_and_names_all(capsys):
     assert max(map(len, lines)) <= 80
     rows = [line for line in lines[1:] if line[13:14] == " " and line[14:15].isalpha()]
     assert sorted(line[14:].split()[0] for line in rows) == sorted(NAMES)
-
-
-def test_a_new_command_is_one_file_and_one_row(tmp_path):
-    """In a scratch copy of the package: nothing else has to know of it."""
-    package = tmp_path / "metrpo"
-    shutil.copytree(Path(metrpo.__file__).parent, package, ignore=shutil.ignore_patterns("__pycache__"))
-    (package / "commands" / "greet.py").write_text(GREET)
-    table = package / "commands" / "command_table.py"
-    table.write_text(table.read_text().replace('        "doctor":', '        "greet": "Say hello",\n        "doctor":'))
-
-    def run_there(*words: str) -> str:
-        environment = os.environ | {"PYTHONPATH": str(tmp_path)}
-        command = [sys.executable, "-m", "metrpo", *words]
-        return subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
-
-    assert "greet      Say hello" in run_there("--help")
-    assert run_there("greet", "you") == "hello you\n"
-
-
-GREET = """
-from dataclasses import dataclass
-
-from tyro.conf import Positional
-
-
-@dataclass(frozen=True)
-class Greet:
-    whom: Positional[str]
-
-
-def run(command):
-    print(f"hello {command.whom}")
-    return 0
-"""
 
 
 def options_in(text):
