@@ -332,11 +332,11 @@ def test_training_checks_first_and_can_be_told_not_to(monkeypatch):
     wrong = dataclasses.replace(pendulum(lambda s, a, n: 0 * s[..., 0]), name="Wrong")
     monkeypatch.setitem(registry._TASKS, "Wrong", wrong)
     config = Config(task="Wrong", evaluation_episodes=1)
-    with pytest.raises(TaskError, match="the reward's formula"):
+    with pytest.raises(TaskError, match="the reward formula disagrees with the environment"):
         training.train(config)
     monkeypatch.setattr(training, "finished", lambda config, state: True)
     assert training.train(dataclasses.replace(config, trust_reward=True)).iteration == 0
-    with pytest.raises(TaskError, match="the reward's formula"):
+    with pytest.raises(TaskError, match="the reward formula disagrees with the environment"):
         training.train(config)
 
 
