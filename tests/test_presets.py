@@ -154,10 +154,10 @@ def test_fast_is_the_default():
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_fast_collects_as_the_paper_does_for_the_same_policy(task):
+def test_fast_collects_no_more_than_the_paper_does_for_the_same_policy(task):
     """It may learn from the data in another way, but it gets no more of them, and the policies are comparable."""
     fast, paper = preset(task), preset(task, "paper")
-    assert fast.collect.steps == paper.collect.steps
+    assert fast.collect.steps <= paper.collect.steps
     assert fast.validate.threshold == paper.validate.threshold
     assert fast.policy.hidden == paper.policy.hidden
 
