@@ -68,9 +68,11 @@ class Trajectories(NamedTuple):
     """The states after the last step."""
     going_on: Float[Array, "N"] = None
     """1 where the episode has neither ended nor diverged by then."""
+    noted: Any = None
+    """[T, N, ...], a pytree: what the policy said besides its actions."""
 
 
-Act = Callable[[Float[Array, "N S"], Key[Array, ""]], Float[Array, "N A"]]
-"""(states, key) -> actions."""
+Act = Callable[[Float[Array, "N S"], Key[Array, ""]], Any]
+"""(states [N, S], key) -> actions [N, A], or a pair of these and what is to be noted with them (a pytree, [N, ...])."""
 Simulate = Callable[[Act, Float[Array, "N S"], Key[Array, ""]], tuple[Trajectories, Any]]
 """(act, start states, key) -> imagined episodes, and what they looked like."""

@@ -30,15 +30,16 @@ class RunOptions(Config):
     """What all other settings start from. fast: learns soonest on two CPU cores; paper: the paper's values;
     long-horizon: for tasks of 1,000 steps."""
     system: Annotated[System, arg(metavar="NAME")] = "me-trpo"
-    """The method: me-trpo, or one to compare it with. trpo, ppo, ddpg, svg-1 and svg-inf learn without the ensemble:
-    trpo, ppo and ddpg on real steps alone (ppo and ddpg are Stable-Baselines3's). Others, such as model-ppo and k-1,
-    change a few settings of me-trpo."""
+    """The method: me-trpo; actor-critic, for long episodes; or one to compare these with. trpo, ppo, ddpg, svg-1 and
+    svg-inf learn without the ensemble: trpo, ppo and ddpg on real steps alone (ppo and ddpg are Stable-Baselines3's).
+    Others, such as model-ppo and k-1, change a few settings of me-trpo."""
     method: Annotated[Method, arg(metavar="NAME")] = "model-based"
     """The loop, which --system chooses: model-based (the paper's), or a baseline: trpo, Stable-Baselines3's ppo and
     ddpg, svg."""
     improver: ImproverName = "trpo"
-    """How the policy is improved on imagined steps: by score functions (trpo, ppo, vpg) or through the models
-    (bptt). This ppo is ours, within the ensemble; --ppo.clip and the like are its settings."""
+    """How the policy is improved on imagined steps: by score functions (trpo, ppo, vpg), through the models
+    (bptt), or by critics and through the models (actor-critic). This ppo is ours, within the ensemble; --ppo.clip and
+    the like are its settings."""
     iterations: int = 10
     """The budget: outer iterations; may be raised later to go on with a finished run."""
     real_steps: Annotated[int | None, arg(metavar="INT")] = None

@@ -42,6 +42,8 @@ ADDED = (
     "config.max_change",
     "config.learn_reward",
     "config.trust_reward",
+    "config.collect.piece",
+    "config.actor_critic",
 )
 """Settings newer than the first config.json files: where one is missing, its default is what was done then."""
 
