@@ -33,6 +33,7 @@ SMALL = override(
         "actor_critic.critic_hidden": (4,),
         "actor_critic.horizon": 2,
         "actor_critic.random_steps": 40,
+        "actor_critic.real_batch": 8,
         "actor_critic.updates_per_step": 0.5,
         "advantage.discount": 0.9,
         "collect.max_train": 200,

@@ -15,10 +15,10 @@ import numpy as np
 from jax.sharding import Mesh
 
 from metrpo import devices
-from metrpo.devices import FIRST, WHOLE, share_of, sharers
+from metrpo.devices import FIRST, SECOND, WHOLE, share_of, sharers
 from metrpo.model.imagine import ImagineInfo, Simulator, imagine
 from metrpo.policy import squashed
-from metrpo.policy.improvers.actor_critic import Learner, UpdateInfo, UpdateSettings, update
+from metrpo.policy.improvers.actor_critic import Learner, Steps, UpdateInfo, UpdateSettings, update
 from metrpo.policy.inputs import normalised
 from metrpo.policy_phase import simulate
 from metrpo.types import Array
@@ -43,35 +43,48 @@ def branches(settings: UpdateSettings, updates: int) -> int:
 
 
 def run_block(
-    settings: UpdateSettings, simulator: Simulator, learner: Learner, starts: np.ndarray, keys: Array
+    settings: UpdateSettings, simulator: Simulator, learner: Learner, starts: np.ndarray, real: Steps, keys: Array
 ) -> tuple[Learner, tuple[UpdateInfo, ImagineInfo]]:
-    """An update for each of `keys`, in one compiled call, from states that the actor reaches from `starts` [N, S]."""
-    mesh = devices.mesh(np.gcd(len(starts), settings.actor_critic.batch_size))
+    """An update for each of `keys` [U], in one compiled call.
+
+    Each starts in states that the actor reaches from `starts` [N, S], and learns from its own of the `real` steps
+    [U, M, ...].
+    """
+    sizes = len(starts), settings.actor_critic.batch_size, settings.actor_critic.real_batch
+    mesh = devices.mesh(int(np.gcd.reduce(sizes)))
     simulator, learner = devices.copied((simulator, learner), mesh)
-    return _compiled_block(settings, mesh, simulator, learner, starts, keys)
+    return _compiled_block(settings, mesh, simulator, learner, starts, real, keys)
 
 
 @partial(jax.jit, static_argnames=("settings", "mesh"))
 def _compiled_block(
-    settings: UpdateSettings, mesh: Mesh, simulator: Simulator, learner: Learner, starts: Array, keys: Array
+    settings: UpdateSettings,
+    mesh: Mesh,
+    simulator: Simulator,
+    learner: Learner,
+    starts: Array,
+    real: Steps,
+    keys: Array,
 ) -> tuple[Learner, tuple[UpdateInfo, ImagineInfo]]:
     a = settings.actor_critic
 
     def block(
-        models: Simulator, learner: Learner, starts: Array, keys: Array
+        models: Simulator, learner: Learner, starts: Array, real: Steps, keys: Array
     ) -> tuple[Learner, tuple[UpdateInfo, ImagineInfo]]:
-        within, beyond = (dataclasses.replace(models, horizon=steps) for steps in (a.horizon, a.branch_steps))
+        beyond = dataclasses.replace(models, horizon=a.branch_steps)
+        within = dataclasses.replace(models, horizon=a.horizon, trusted=None)
         pool = reached(beyond, learner, starts, jax.random.fold_in(keys[0], _BRANCH))
 
-        def one(learner: Learner, key: Array) -> tuple[Learner, tuple[UpdateInfo, ImagineInfo]]:
+        def one(learner: Learner, given: tuple[Array, Steps]) -> tuple[Learner, tuple[UpdateInfo, ImagineInfo]]:
+            key, steps = given
             batch = drawn(pool, a.batch_size // sharers(), share_of(jax.random.fold_in(key, _DRAW)))
-            learner, info, imagined = update(settings, partial(simulate, within), learner, batch, key)
+            learner, info, imagined = update(settings, partial(simulate, within), learner, batch, steps, key)
             return learner, (info, imagined)
 
-        return jax.lax.scan(one, learner, keys)
+        return jax.lax.scan(one, learner, (keys, real))
 
-    spread = devices.spread(block, mesh, (WHOLE, WHOLE, FIRST, WHOLE), WHOLE)
-    after: tuple[Learner, tuple[UpdateInfo, ImagineInfo]] = spread(simulator, learner, starts, keys)
+    spread = devices.spread(block, mesh, (WHOLE, WHOLE, FIRST, SECOND, WHOLE), WHOLE)
+    after: tuple[Learner, tuple[UpdateInfo, ImagineInfo]] = spread(simulator, learner, starts, real, keys)
     return after
 
 

@@ -297,10 +297,16 @@ class ActorCriticConfig:
     """Real steps of uniformly random actions, at least, which the first iteration collects."""
     batch_size: int = 256
     """States from which an update imagines."""
+    real_batch: int = 256
+    """Real transitions from which the critics learn in every update, besides imagined ones."""
     horizon: int = 5
-    """Steps that an update imagines: for the critics' targets, and for the actor's gradient through the models."""
+    """Steps that an update imagines: for the critics' targets, and for the actor's gradient through the models. 0:
+    none, the critics learn from real transitions alone (soft actor-critic)."""
     branch_steps: int = 20
     """Steps imagined from states of the dataset; updates start in the states that these reach."""
+    trust: float = 1.0
+    """These are cut where members disagree by more than this times their disagreement on 95 % of the held-out data; 0:
+    never."""
     margin: float = 0.25
     """Imagined states, their changes and learned rewards stay within the data's range, and this times it beyond."""
     block: int = 50
@@ -329,8 +335,12 @@ class ActorCriticConfig:
         for field_ in ("updates_per_step", "critic_learning_rate", "entropy_weight", "entropy_learning_rate"):
             value = getattr(self, field_)
             require(positive(value), f"{name}.{field_}", value, "a finite number > 0")
-        for field_ in ("batch_size", "horizon", "branch_steps", "block", "critics", "critic_steps"):
+        for field_ in ("batch_size", "branch_steps", "block", "critics", "critic_steps"):
             require(getattr(self, field_) >= 1, f"{name}.{field_}", getattr(self, field_), "at least 1")
+        require(self.horizon >= 0, f"{name}.horizon", self.horizon, "at least 0")
+        least = 0 if self.horizon else 1
+        require(self.real_batch >= least, f"{name}.real_batch", self.real_batch, f"at least {least}")
+        require(nonnegative(self.trust), f"{name}.trust", self.trust, "a finite number >= 0")
         require(self.random_steps >= 0, f"{name}.random_steps", self.random_steps, "at least 0")
         require(nonnegative(self.margin), f"{name}.margin", self.margin, "a finite number >= 0")
         hidden = self.critic_hidden

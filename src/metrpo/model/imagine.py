@@ -64,6 +64,8 @@ class Simulator:
     """What its actions are held to."""
     bounds: Bounds | None = None
     """What predictions are brought within; None: anything goes."""
+    trusted: Float[Array, ""] | None = None
+    """Episodes are cut after a step in which the models disagree by more than this; None: never."""
 
     def nothing_before(self, *rows: int) -> Array | None:
         """The actions before the first step, [*rows, A]; None where they do not matter."""
@@ -143,6 +145,8 @@ def imagine(
         diverged = diverged | (bad & (alive > 0))
         if ended is not None:
             alive = alive * (1.0 - ended)
+        if simulator.trusted is not None:
+            alive = alive * (disagreement(models, states, clipped) <= simulator.trusted)
         # A diverged rollout stands still, so that it stays finite; it is masked below.
         following = jnp.where(bad[:, None], states, following)
         return (following, alive, diverged, None if before is None else clipped), recorded

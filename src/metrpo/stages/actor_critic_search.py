@@ -20,13 +20,13 @@ from metrpo.config import Config
 from metrpo.console.progress import Progress
 from metrpo.errors import ConfigError
 from metrpo.model.bounds import bounds_of
-from metrpo.model.ensemble import Ensemble
-from metrpo.model.imagine import ImagineInfo, Simulator
+from metrpo.model.ensemble import Ensemble, with_carried
+from metrpo.model.imagine import ImagineInfo, Simulator, disagreement, outcome
 from metrpo.policy import gaussian, squashed
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers import actor_critic
-from metrpo.policy.improvers.actor_critic import Learner, UpdateInfo, UpdateSettings
-from metrpo.policy.inputs import normalised
+from metrpo.policy.improvers.actor_critic import Learner, Steps, UpdateInfo, UpdateSettings
+from metrpo.policy.inputs import Inputs, normalised
 from metrpo.policy.stopping import improved
 from metrpo.policy.value.critics import Scale, rescaled, scale_of
 from metrpo.policy_phase import PhaseInfo, simulator_of, values_of
@@ -42,6 +42,9 @@ from metrpo.world.task import Task
 
 _LOOKED_AT = 1000
 """States of the dataset, the newest, on which the policy is described for the record."""
+_COMPARED, _MOST = 1000, 0.95
+"""Held-out steps, and the share of them, that decide how far models are trusted."""
+_disagreement = jax.jit(disagreement)
 _NEAR = 0.99
 """Mean actions of a squashed policy beyond this saturate."""
 
@@ -89,14 +92,20 @@ def improve_policy(
     rng, key = rng_of(config.seed, iteration, Stage.IMPROVE), key_of(config.seed, iteration, Stage.IMPROVE)
     known, inputs = shifted(task, dataset.origin), inputs_for(config, task, dataset)
     bounds = bounds_of(dataset.train, config.actor_critic.margin, task.unseen)
-    simulator = dataclasses.replace(simulator_of(config, known, ensemble, inputs), bounds=bounds)
-    before = learner = _in_units(state, scale_of(_rewards(known, dataset), settings.discount, bool(task.terminated)))
+    simulator = dataclasses.replace(
+        simulator_of(config, known, ensemble, inputs), bounds=bounds, trusted=_trusted(config, ensemble, dataset, rng)
+    )
+    real_steps = _real_steps(known, ensemble, dataset)
+    before = learner = _in_units(state, scale_of(real_steps.rewards, settings.discount, bool(task.terminated)))
+    real_steps = _seen(inputs, real_steps)
     infos: list[tuple[UpdateInfo, ImagineInfo]] = []
     block, blocks = config.actor_critic.block, _blocks(config, state.real_steps)
     for number in range(blocks):
         starts = dataset.train.states[rng.integers(dataset.train.size, size=branches(settings, block))]
+        rows = rng.integers(dataset.train.size, size=(block, config.actor_critic.real_batch))
+        steps = jax.tree.map(lambda x, rows=rows: x[rows], real_steps)
         keys = jax.random.split(jax.random.fold_in(key, number), block)
-        learner, happened = run_block(settings, simulator, learner, starts, keys)
+        learner, happened = run_block(settings, simulator, learner, starts, steps, keys)
         infos.append(jax.device_get(happened))
         progress.update((number + 1) * block, _note(infos[-1][0]))
     learner = jax.device_get(learner)
@@ -135,13 +144,31 @@ def _in_units(state: State, scale: Scale) -> Learner:
     return learner._replace(critics=critics, targets=targets, scale=scale)
 
 
-def _rewards(task: Task, dataset: Dataset) -> np.ndarray:
-    """Of the transitions to learn from, [n]."""
+def _real_steps(task: Task, ensemble: Ensemble, dataset: Dataset) -> Steps:
+    """The transitions to learn from, in raw states."""
     states, actions, deltas, _ = dataset.train
-    size = states.shape[1]
-    if task.reward is None:
-        return deltas[:, size]
-    return np.asarray(task.reward(states, actions, states + deltas[:, :size]))
+    size = states.shape[1] - len(ensemble.carried.indices)
+    changing = np.concatenate([states[:, :size] + deltas[:, :size], deltas[:, size:]], axis=1)
+    predicted = np.asarray(with_carried(ensemble, states, actions, changing))
+    following, rewards, ended = outcome(task.reward, task.terminated, states, actions, predicted)
+    going_on = np.ones(len(states)) if ended is None else 1.0 - np.asarray(ended)
+    return Steps(states, actions, np.asarray(rewards, np.float32), following, going_on.astype(np.float32))
+
+
+def _seen(inputs: Inputs | None, steps: Steps) -> Steps:
+    """The same steps in states as the actor sees them."""
+    if inputs is None:
+        return steps
+    return steps._replace(states=normalised(inputs, steps.states), following=normalised(inputs, steps.following))
+
+
+def _trusted(config: Config, ensemble: Ensemble, dataset: Dataset, rng: np.random.Generator) -> Array | None:
+    """The disagreement, [], beyond which branches are cut: what the models have on real steps that they did not see."""
+    if not config.actor_critic.trust:
+        return None
+    rows = rng.integers(dataset.validation.size, size=_COMPARED)
+    real = _disagreement(ensemble, dataset.validation.states[rows], dataset.validation.actions[rows])
+    return jnp.float32(config.actor_critic.trust * np.quantile(real, _MOST))
 
 
 def _values(config: Config, simulator: Simulator, policies: list[Policy], starts: np.ndarray) -> list[np.ndarray]:

@@ -16,7 +16,15 @@ from metrpo.config import Config
 from metrpo.model.imagine import ImagineInfo, Simulator
 from metrpo.policy import squashed
 from metrpo.policy.improvers import actor_critic
-from metrpo.policy.improvers.actor_critic import UpdateSettings, actor_gradient, expanded, soft_returns, update
+from metrpo.policy.improvers.actor_critic import (
+    Steps,
+    UpdateSettings,
+    actor_gradient,
+    expanded,
+    of_real,
+    soft_returns,
+    update,
+)
 from metrpo.policy.squashed import Actor
 from metrpo.policy.value import critics as networks
 from metrpo.policy.value.critics import Scale, valued
@@ -58,6 +66,15 @@ def simulator(members=1, ends=None, horizon=4):
 
 def starts(count=6):
     return np.random.default_rng(5).uniform(-0.7, 0.7, (count, 2)).astype(np.float32)
+
+
+def real_steps(count=5, ends=0.0):
+    """Steps of the linear system itself."""
+    rng = np.random.default_rng(7)
+    states, actions = (rng.uniform(-0.7, 0.7, (count, 2)).astype(np.float32) for _ in range(2))
+    following = (states @ probe.A.T + actions @ probe.B.T).astype(np.float32)
+    rewards = probe.reward(states, actions, following).astype(np.float32)
+    return Steps(states, actions, rewards, following, np.full(count, 1.0 - ends, np.float32))
 
 
 # ---------------------------------------------------------------- value expansion
@@ -105,7 +122,10 @@ def test_soft_returns_are_those_of_a_slow_version():
 def test_targets_are_valued_by_the_least_of_the_target_critics():
     r, one = rollouts_of(1), learner()
     last = (r.last, np.zeros_like(r.last), np.full(7, 0.4, np.float32))
-    got = np.asarray(expanded(SETTINGS, one, r, last))
+    lessons = expanded(SETTINGS, one, r, last)
+    for got, given in zip((lessons.states, lessons.actions, lessons.mask), (r.states, r.actions, r.mask), strict=True):
+        np.testing.assert_array_equal(got, given[:3].reshape(21, *given.shape[2:]))
+    got = np.asarray(lessons.targets).reshape(3, 7)
     said = np.asarray(valued(WIDE, networks.outputs(one.targets, *last[:2]))).min(axis=0)
     weight = math.exp(float(one.log_entropy_weight))
     expected = [[slow_return(r, t, n, weight, 0.9, said - weight * 0.4) for n in range(7)] for t in range(3)]
@@ -116,9 +136,22 @@ def test_what_no_return_can_be_is_no_target():
     r, one = rollouts_of(2), learner()
     low = one._replace(scale=WIDE._replace(highest=np.float32(-50.0)))
     last = (r.last, np.zeros_like(r.last), np.zeros(7, np.float32))
-    free, bound = (np.asarray(expanded(SETTINGS, x, r, last)) for x in (one, low))
+    free, bound = (np.asarray(expanded(SETTINGS, x, r, last).targets) for x in (one, low))
     assert free.max() > -50
     assert bound.max() == -50
+
+
+@pytest.mark.parametrize("ends", [0.0, 1.0])
+def test_of_real_steps_the_reward_is_known_and_the_least_of_the_target_critics_follows(ends):
+    one, real = learner(), real_steps(ends=ends)
+    lessons = of_real(SETTINGS, one, real, KEY)
+    actions, log_probs = squashed.sample(one.actor, real.following, KEY)
+    said = np.asarray(valued(WIDE, networks.outputs(one.targets, real.following, actions))).min(axis=0)
+    after = said - math.exp(float(one.log_entropy_weight)) * np.asarray(log_probs)
+    np.testing.assert_allclose(lessons.targets, real.rewards + 0.9 * (1 - ends) * after, rtol=1e-5)
+    np.testing.assert_array_equal(lessons.states, real.states)
+    np.testing.assert_array_equal(lessons.actions, real.actions)
+    np.testing.assert_array_equal(lessons.mask, np.ones(5))
 
 
 # ---------------------------------------------------------------- the actor's gradient
@@ -175,7 +208,7 @@ def test_expansion_is_the_known_return_of_a_linear_system():
     none = jax.tree.map(jnp.zeros_like, one.critics)
     one = one._replace(critics=none, targets=none, scale=WIDE._replace(middle=np.float32(0)))
     _, (r, last, _) = jax.jit(partial(actor_gradient, SETTINGS, partial(simulate, simulator())))(one, starts(), KEY)
-    got = np.asarray(expanded(SETTINGS, one, r, last))[0]
+    got = np.asarray(expanded(SETTINGS, one, r, last).targets)[: len(starts())]
     states, total = starts().astype(np.float64), 0.0
     for t in range(4):
         actions = np.tanh(-0.5 * states)
@@ -193,7 +226,7 @@ def compiled():
 def test_an_update_averages_the_targets_and_weighs_the_entropy(compiled):
     """Adam's first steps are of its step size: down where the entropy is above its target (std 1: it is), else up."""
     one = learner()
-    new, info, imagined = compiled(one, starts(), KEY)
+    new, info, imagined = compiled(one, starts(), real_steps(), KEY)
     assert info.accepted
     assert float(imagined.diverged) == 0
     moved = jax.tree.map(lambda old, to: old + 0.005 * (to - old), one.targets, new.critics)
@@ -203,7 +236,7 @@ def test_an_update_averages_the_targets_and_weighs_the_entropy(compiled):
     assert float(new.log_entropy_weight - one.log_entropy_weight) == pytest.approx(-3e-4, rel=1e-2)
     (first, (weights, biases)) = one.actor.layers
     calm = Actor((first, (weights, biases.at[2:].set(-9.0))))
-    still, info, _ = compiled(one._replace(actor=calm), starts(), KEY)
+    still, info, _ = compiled(one._replace(actor=calm), starts(), real_steps(), KEY)
     assert float(info.entropy) < -2
     assert float(still.log_entropy_weight - one.log_entropy_weight) == pytest.approx(3e-4, rel=1e-2)
 
@@ -213,11 +246,34 @@ def test_updates_learn_the_value_and_improve_the_policy(compiled):
     one = learner()
     losses = []
     for i in range(600):
-        one, info, _ = compiled(one, starts(), jax.random.fold_in(KEY, i))
+        one, info, _ = compiled(one, starts(), real_steps(), jax.random.fold_in(KEY, i))
         losses.append(float(info.critic_loss))
     assert np.mean(losses[-50:]) < 0.3 * np.mean(losses[:5])
     means = np.tanh(squashed.moments(one.actor, starts(32))[0])
     assert np.mean(np.sum(means * starts(32), axis=1)) < -0.02
+
+
+def test_without_imagined_steps_it_is_soft_actor_critic():
+    """The critics learn from real steps alone, the actor from what critics say of its actions in the starts."""
+    settings = UpdateSettings.of(override(CONFIG, {"actor_critic.horizon": 0}))
+    one, sim = learner(settings), partial(simulate, simulator(2, horizon=0))
+    gradient, (_, (states, *_), _) = jax.jit(partial(actor_gradient, settings, sim))(one, starts(), KEY)
+    np.testing.assert_array_equal(states, starts())
+
+    def objective(actor):
+        drawn, log_probs = squashed.sample(actor, starts(), jax.random.fold_in(KEY, actor_critic._LAST))
+        said = valued(WIDE, networks.outputs(one.critics, starts(), drawn)).mean(axis=0)
+        return jnp.mean(said - jnp.exp(one.log_entropy_weight) * log_probs) / WIDE.width
+
+    for got, expected in zip(*map(jax.tree.leaves, (gradient, jax.grad(objective)(one.actor))), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-6)
+    new, info, _ = jax.jit(partial(update, settings, sim))(one, starts(), real_steps(), KEY)
+    said = np.asarray(networks.outputs(one.critics, *real_steps()[:2]))
+    lessons = of_real(settings, one, real_steps(), jax.random.fold_in(KEY, actor_critic._REAL))
+    aims = (np.asarray(lessons.targets) - WIDE.middle) / WIDE.width
+    assert info.accepted
+    assert float(info.critic_loss) == pytest.approx(float(np.mean(np.square(said - aims))), rel=1e-4)
+    assert not np.array_equal(new.actor.layers[0][0], one.actor.layers[0][0])
 
 
 # ---------------------------------------------------------------- what is not finite
@@ -231,7 +287,7 @@ def test_an_update_that_is_not_finite_changes_nothing(value):
 
     poison = [value]
     one = learner()
-    new, info, _ = jax.jit(partial(update, SETTINGS, spoilt))(one, starts(), KEY)
+    new, info, _ = jax.jit(partial(update, SETTINGS, spoilt))(one, starts(), real_steps(), KEY)
     assert not info.accepted
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(info))
     for got, before in zip(jax.tree.leaves(new), jax.tree.leaves(one), strict=True):
@@ -245,7 +301,7 @@ def test_without_a_step_that_counts_nothing_moves():
         return rollouts._replace(mask=none, going_on=none[0]), ImagineInfo(info.mean_return, info.diverged, 0.0)
 
     one = learner()
-    new, info, _ = jax.jit(partial(update, SETTINGS, nothing))(one, starts(), KEY)
+    new, info, _ = jax.jit(partial(update, SETTINGS, nothing))(one, starts(), real_steps(), KEY)
     assert not info.accepted
     for got, before in zip(jax.tree.leaves(new), jax.tree.leaves(one), strict=True):
         np.testing.assert_array_equal(got, before)

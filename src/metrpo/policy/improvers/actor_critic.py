@@ -24,8 +24,8 @@ from metrpo.policy.value import critics as critic_networks
 from metrpo.policy.value.critics import Critics, Scale, averaged, valued
 from metrpo.types import Array, Simulate, Trajectories
 
-_LAST = 2**31 - 3
-"""Derives the key of the actions in the last states."""
+_LAST, _REAL = 2**31 - 3, 2**31 - 2
+"""Derive the keys of the actions in the last imagined states, and in those after real steps."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +63,21 @@ class Learner(NamedTuple):
     scale: Scale
 
 
+class Steps(NamedTuple):
+    """Real transitions, which critics learn from; states as the actor sees them."""
+
+    states: Array
+    """[M, S]"""
+    actions: Array
+    """[M, A]"""
+    rewards: Array
+    """[M]"""
+    following: Array
+    """[M, S], the next states."""
+    going_on: Array
+    """[M], 0 where the episode ended with the step."""
+
+
 class UpdateInfo(NamedTuple):
     """What one update did."""
 
@@ -97,20 +112,23 @@ def _optimizers(settings: UpdateSettings) -> tuple[optax.GradientTransformation,
 
 
 def update(
-    settings: UpdateSettings, simulate: Simulate, learner: Learner, starts: Array, key: Array
+    settings: UpdateSettings, simulate: Simulate, learner: Learner, starts: Array, real: Steps, key: Array
 ) -> tuple[Learner, UpdateInfo, Any]:
-    """One step of critics, actor and entropy weight on episodes imagined from `starts` [N, S].
+    """One step of critics, actor and entropy weight on episodes imagined from `starts` [N, S] and on `real` steps.
 
     The third part of the result is what the simulation says of its episodes. An update that is not finite anywhere
     changes nothing.
     """
     gradient, (rollouts, last, imagined) = actor_gradient(settings, simulate, learner, starts, key)
-    targets = expanded(settings, learner, rollouts, last)
-    loss, value, critic_gradient = _critic_gradient(settings, learner, rollouts, targets)
-    entropy = _mean(-rollouts.noted[0], rollouts.mask[0])
+    lessons = of_real(settings, learner, real, jax.random.fold_in(key, _REAL))
+    if settings.actor_critic.horizon:
+        lessons = jax.tree.map(lambda *xs: jnp.concatenate(xs), lessons, expanded(settings, learner, rollouts, last))
+    loss, value, critic_gradient = _critic_gradient(learner, lessons)
+    at_first = (rollouts.noted[0], rollouts.mask[0]) if settings.actor_critic.horizon else (last[2], rollouts.going_on)
+    entropy = _mean(-at_first[0], at_first[1])
     new = _stepped(settings, learner, gradient, critic_gradient, entropy)
     leaves = jax.tree.leaves((new, gradient, critic_gradient, loss))
-    sound = (imagined.steps > 0) & jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
+    sound = (jnp.sum(at_first[1]) > 0) & jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
     new = jax.tree.map(lambda now, before: jnp.where(sound, now, before), new, learner)
     info = UpdateInfo(loss, value, entropy, optax.tree.norm(gradient), sound)
     return new, jax.tree.map(lambda x: jnp.where(sound, x, jnp.zeros_like(x)), info), imagined
@@ -132,10 +150,13 @@ def actor_gradient(
         actions, log_probs = squashed.sample(actor, rollouts.last, last_key)
         said = critic_networks.outputs(learner.critics, rollouts.last, actions)
         after = valued(learner.scale, jnp.mean(said, axis=0) if a.terminal == "mean" else jnp.min(said, axis=0))
-        returns = soft_returns(rollouts, weight, settings.discount, after - weight * log_probs)
-        first = returns[0] - weight * rollouts.noted[0]
+        if a.horizon:
+            returns = soft_returns(rollouts, weight, settings.discount, after - weight * log_probs)
+            first, mask = returns[0] - weight * rollouts.noted[0], rollouts.mask[0]
+        else:
+            first, mask = after - weight * log_probs, rollouts.going_on
         # Diverged episodes have a mask of 0, but what they met may be no number.
-        summed = jnp.sum(jnp.where(rollouts.mask[0] > 0, first, 0.0)) / learner.scale.width
+        summed = jnp.sum(jnp.where(mask > 0, first, 0.0)) / learner.scale.width
         return summed, (rollouts, (rollouts.last, actions, log_probs), imagined)
 
     gradient, happened = jax.grad(total, has_aux=True)(learner.actor)
@@ -160,22 +181,47 @@ def soft_returns(rollouts: Trajectories, weight: Array, discount: float, after: 
     return jax.lax.scan(back, after, steps, reverse=True)[1]
 
 
-def expanded(settings: UpdateSettings, learner: Learner, rollouts: Trajectories, last: Last) -> Array:
-    """Targets [k, N] for the first k states of the episodes: value expansion, within the bounds of the scale."""
-    states, actions, log_probs = last
-    weight, scale = jnp.exp(learner.log_entropy_weight), learner.scale
+class Lessons(NamedTuple):
+    """What critics learn from."""
+
+    states: Array
+    """[L, S]"""
+    actions: Array
+    """[L, A]"""
+    targets: Array
+    """[L], soft returns within the bounds of the scale."""
+    mask: Array
+    """[L], 1 where a lesson is one."""
+
+
+def expanded(settings: UpdateSettings, learner: Learner, rollouts: Trajectories, last: Last) -> Lessons:
+    """Of the first states of imagined episodes: all that follows there, then the target critics (value expansion)."""
+    weight, scale, steps = jnp.exp(learner.log_entropy_weight), learner.scale, settings.actor_critic.critic_steps
+    returns = soft_returns(rollouts, weight, settings.discount, _after(learner, *last))
+    lessons = Lessons(rollouts.states, rollouts.actions, jnp.clip(returns, scale.lowest, scale.highest), rollouts.mask)
+    return jax.tree.map(lambda x: x[:steps].reshape(-1, *x.shape[2:]), lessons)
+
+
+def of_real(settings: UpdateSettings, learner: Learner, real: Steps, key: Array) -> Lessons:
+    """Of real steps: their reward, then the target critics."""
+    actions, log_probs = squashed.sample(learner.actor, real.following, share_of(key))
+    after = _after(learner, real.following, actions, log_probs)
+    targets = real.rewards + settings.discount * real.going_on * after
+    clipped = jnp.clip(targets, learner.scale.lowest, learner.scale.highest)
+    return Lessons(real.states, real.actions, clipped, jnp.ones_like(clipped))
+
+
+def _after(learner: Learner, states: Array, actions: Array, log_probs: Array) -> Array:
+    """The soft value of states [N, S] in which the actor draws `actions`, by the least of the target critics, [N]."""
+    scale = learner.scale
     said = jnp.min(critic_networks.outputs(learner.targets, states, actions), axis=0)
-    after = jnp.clip(valued(scale, said), scale.lowest, scale.highest)
-    returns = soft_returns(rollouts, weight, settings.discount, after - weight * log_probs)
-    return jnp.clip(returns[: settings.actor_critic.critic_steps], scale.lowest, scale.highest)
+    value = jnp.clip(valued(scale, said), scale.lowest, scale.highest)
+    return value - jnp.exp(learner.log_entropy_weight) * log_probs
 
 
-def _critic_gradient(
-    settings: UpdateSettings, learner: Learner, rollouts: Trajectories, targets: Array
-) -> tuple[Array, Array, Critics]:
+def _critic_gradient(learner: Learner, lessons: Lessons) -> tuple[Array, Array, Critics]:
     """The critics' loss, what they say on average, and the loss's gradient."""
-    steps, scale = targets.shape[0], learner.scale
-    states, actions, mask = (x[:steps] for x in (rollouts.states, rollouts.actions, rollouts.mask))
+    scale, (states, actions, targets, mask) = learner.scale, lessons
     aims = (targets - scale.middle) / scale.width
 
     def loss(critics: Critics) -> tuple[Array, tuple[Array, Array]]:
