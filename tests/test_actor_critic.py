@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import types
 
 import jax
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import probe
+from helpers import linear_ensemble
 from metrpo import algorithm, training
 from metrpo.config import Config
 from metrpo.errors import ConfigError
@@ -152,6 +154,33 @@ def test_it_acts_at_random_first_and_then_by_the_actor(small):
     seen = normalised(inputs_for(SMALL, probe.PROBE, small.states[1].dataset), np.zeros(2))
     rng = np.random.default_rng(0)
     np.testing.assert_array_equal(later, [squashed.draw(actor, seen, rng) for _ in range(300)])
+
+
+def test_real_steps_are_those_of_the_dataset_with_rewards_and_ends(small):
+    data, ensemble = small.states[1].dataset, linear_ensemble([(probe.A, probe.B)])
+    states, actions, deltas, _ = data.train
+    steps = actor_critic_search._real_steps(probe.PROBE, ensemble, data)
+    np.testing.assert_array_equal(steps.following, states + deltas)
+    np.testing.assert_allclose(steps.rewards, probe.reward(states, actions, states + deltas), rtol=1e-5)
+    assert set(steps.going_on) == {1.0}
+    ending = dataclasses.replace(probe.PROBE, terminated=lambda following: following[..., 0] > 0)
+    going_on = actor_critic_search._real_steps(ending, ensemble, data).going_on
+    np.testing.assert_array_equal(going_on, steps.following[:, 0] <= 0)
+    assert 0 < going_on.mean() < 1
+
+
+def test_models_are_trusted_as_far_as_they_agree_on_most_of_the_held_out_steps(small):
+    data = small.states[1].dataset
+    ensemble = linear_ensemble([(probe.A * factor, probe.B) for factor in (0.9, 1.1)])
+    apart = np.abs(0.1 * data.validation.states @ probe.A.T).mean(axis=1)
+
+    def trusted(trust):
+        config = override(SMALL, {"actor_critic.trust": trust})
+        return actor_critic_search._trusted(config, ensemble, data, np.random.default_rng(0))
+
+    assert np.quantile(apart, 0.85) < float(trusted(1.0)) <= apart.max() * 1.001
+    assert float(trusted(2.0)) == pytest.approx(2 * float(trusted(1.0)))
+    assert trusted(0.0) is None
 
 
 def test_without_a_discount_it_is_refused():

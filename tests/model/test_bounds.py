@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 import probe
 from helpers import linear_ensemble
 from metrpo.model.bounds import bounded, bounds_of
-from metrpo.model.imagine import Simulator, returns_per_model
+from metrpo.model.imagine import Simulator, imagine, returns_per_model
 from metrpo.types import Transitions
 
 
@@ -51,3 +52,12 @@ def test_a_model_that_explodes_keeps_a_finite_return():
     held = Simulator(ensemble, probe.reward, None, 30, bounds=bounds_of(data(), 0.25))
     assert np.isnan(returns_per_model(free, jnp.zeros_like, starts)).all()
     assert np.isfinite(returns_per_model(held, jnp.zeros_like, starts)).all()
+
+
+def test_an_episode_is_cut_after_a_step_in_which_members_disagree_too_much():
+    members = [(np.eye(2) * factor, np.zeros((2, 2))) for factor in (0.9, 1.1)]
+    starts = np.array([[1, 1], [0.2, 0.2]], np.float32)  # members disagree by a tenth of the state
+    simulator = Simulator(linear_ensemble(members), probe.reward, None, 3, trusted=jnp.float32(0.05))
+    imagined, _ = imagine(simulator, lambda states, key: jnp.zeros_like(states), starts, jax.random.key(0))
+    np.testing.assert_array_equal(imagined.mask, [[1, 1], [0, 1], [0, 1]])
+    np.testing.assert_array_equal(imagined.going_on, [0, 1])

@@ -31,7 +31,6 @@ from metrpo.policy.stopping import improved
 from metrpo.policy.value.critics import Scale, rescaled, scale_of
 from metrpo.policy_phase import PhaseInfo, simulator_of, values_of
 from metrpo.run.clock import Clock
-from metrpo.run.metrics import Row
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.stages.state import State, inputs_for
 from metrpo.types import Array
@@ -179,7 +178,7 @@ def _values(config: Config, simulator: Simulator, policies: list[Policy], starts
     return [values_of(plain, policy, chosen) for policy in policies]
 
 
-def _columns(updates: UpdateInfo, learner: Learner, policy: Policy, states: np.ndarray) -> Row:
+def _columns(updates: UpdateInfo, learner: Learner, policy: Policy, states: np.ndarray) -> dict[str, float]:
     """What the row of metrics says of an actor-critic alone."""
     made = updates.accepted
 

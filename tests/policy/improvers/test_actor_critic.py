@@ -261,7 +261,7 @@ def test_without_imagined_steps_it_is_soft_actor_critic():
     np.testing.assert_array_equal(states, starts())
 
     def objective(actor):
-        drawn, log_probs = squashed.sample(actor, starts(), jax.random.fold_in(KEY, actor_critic._LAST))
+        drawn, log_probs = squashed.sample(actor, jnp.asarray(starts()), jax.random.fold_in(KEY, actor_critic._LAST))
         said = valued(WIDE, networks.outputs(one.critics, starts(), drawn)).mean(axis=0)
         return jnp.mean(said - jnp.exp(one.log_entropy_weight) * log_probs) / WIDE.width
 
