@@ -286,7 +286,7 @@ def test_the_previous_policy_precedes_the_last_changing_phase(tiny, monkeypatch,
 def test_parameter_noise_is_in_proportion_to_each_change():
     now, before = random_policy(0, 3, 2, hidden=(40,)), random_policy(1, 3, 2, hidden=(40,))
     rng = np.random.default_rng(0)
-    drawn = [real_steps.perturbed(now, before, 3.0, rng).args[0] for _ in range(2000)]
+    drawn = [policy_search.perturbed(now, before, 3.0, rng).args[0] for _ in range(2000)]
     weights = np.array([d.layers[0][0] for d in drawn])
     z = (weights - now.layers[0][0]) / np.abs(now.layers[0][0] - before.layers[0][0])
     assert z.mean() == pytest.approx(0, abs=0.03)
@@ -294,8 +294,8 @@ def test_parameter_noise_is_in_proportion_to_each_change():
     assert np.abs(np.corrcoef(z.reshape(2000, -1)[:, :10].T) - np.eye(10)).max() < 0.1
     assert drawn[0].layers[1][1] != pytest.approx(drawn[1].layers[1][1])
     state = np.array([0.1, 0.2, 0.3])
-    np.testing.assert_allclose(real_steps.perturbed(now, before, 0.0, rng)(state), slow_mean(now, state), atol=1e-5)
-    np.testing.assert_allclose(real_steps.perturbed(now, now, 3.0, rng)(state), slow_mean(now, state), atol=1e-5)
+    np.testing.assert_allclose(policy_search.perturbed(now, before, 0.0, rng)(state), slow_mean(now, state), atol=1e-5)
+    np.testing.assert_allclose(policy_search.perturbed(now, now, 3.0, rng)(state), slow_mean(now, state), atol=1e-5)
 
 
 def test_the_clock_counts_nothing_twice(monkeypatch):
@@ -556,7 +556,7 @@ def test_parameter_noise_does_not_know_the_units_of_the_states(offset, scale):
 
     def actions(inputs, states):
         policies = (folded(p, inputs) for p in (now, before))
-        act = real_steps.perturbed(*policies, 3.0, np.random.default_rng(5), inputs)
+        act = policy_search.perturbed(*policies, 3.0, np.random.default_rng(5), inputs)
         return np.array([act(s) for s in states])
 
     np.testing.assert_allclose(actions(other, offset + scale * rows), actions(plain, rows), atol=0.05)

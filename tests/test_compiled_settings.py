@@ -14,15 +14,15 @@ import pytest
 import metrpo
 from metrpo.config import AdvantageConfig, Config, ImagineConfig, ValidateConfig
 from metrpo.model.sampling import SAMPLINGS
-from metrpo.policy.improvers.improver_table import IMPROVERS
 from metrpo.policy.improvers.settings import PhaseSettings
 from metrpo.policy.stopping import RULES
 from metrpo.policy.value.value_table import VALUE_FUNCTIONS
 from metrpo.presets import override
+from metrpo.stages.search import SEARCHES
 
-ROOMS = ("algorithm", "stages", "policy_phase", "model", "policy", "baselines")
+ROOMS = ("algorithm", "stages", "policy_phase", "actor_critic_phase", "model", "policy", "baselines")
 CHOICES = [
-    (Config, "improver", IMPROVERS),
+    (Config, "improver", SEARCHES),
     (AdvantageConfig, "baseline", VALUE_FUNCTIONS),
     (ImagineConfig, "sampling", SAMPLINGS),
     (ValidateConfig, "rule", RULES),

@@ -27,6 +27,7 @@ CITED = {
     "collect.std_per": ("episode", "A.1.1: at the beginning of every roll-out, fixed throughout the episode"),
     "collect.parameter_noise": (3.0, "A.1.1: proportional to the absolute difference of parameters; factor 3.0: code"),
     "collect.validation_fraction": (1 / 3, "A.1.1: 2-to-1 ratio for training and validation"),
+    "collect.piece": (None, "A.1.1: whole episodes, as nothing else is said"),
     "collect.max_train": (200_000, "code: first in, first out"),
     "collect.max_validation": (100_000, "code: first in, first out"),
     "ensemble.members": (5, 'B, "Ablation study": ME-TRPO with 5 models'),
@@ -114,7 +115,7 @@ OURS = {
     "learn_reward": (False, "section 2: the reward function is known"),
     **{
         f"{section}.{name}": (value, "used by the systems that the paper compares with, not by me-trpo")
-        for section in ("gradient", "ppo", "svg")
+        for section in ("gradient", "ppo", "svg", "actor_critic")
         for name, value in vars(getattr(Config("x"), section)).items()
     },
     "validate.max_updates": (400, "a bound that keeps one phase from running forever"),
@@ -221,5 +222,5 @@ def test_the_papers_systems_differ_from_each_other():
 
 
 def test_an_unknown_system_is_refused_with_the_known_ones():
-    with pytest.raises(ConfigError, match=r"system: expected one of me-trpo, .*svg-inf, got 'a3c'"):
+    with pytest.raises(ConfigError, match=r"system: expected one of me-trpo, .*svg-inf, actor-critic, got 'a3c'"):
         preset("Swimmer", "fast", "a3c")

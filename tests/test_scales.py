@@ -29,7 +29,7 @@ from metrpo.run.episodes import EpisodeLog
 from metrpo.run.files import read_arrays, write_arrays
 from metrpo.run.policy_export import export
 from metrpo.run.policy_file import Learned, load_policy, save_policy
-from metrpo.stages import records
+from metrpo.stages import policy_search, records
 from metrpo.types import Episode
 from metrpo.world import dataset as datasets
 from metrpo.world import registry
@@ -254,8 +254,8 @@ def learn_at_once(monkeypatch):
         return random_ensemble(0, 2, task.state_size, task.action_size).networks
 
     monkeypatch.setattr(algorithm, "fresh_networks", networks)
-    monkeypatch.setattr(algorithm.gaussian, "init", lambda key, s, a, hidden, std: random_policy(0, s, a, hidden))
-    monkeypatch.setattr(algorithm, "init_baseline", lambda *_: np.zeros(1, np.float32))
+    monkeypatch.setattr(policy_search.gaussian, "init", lambda key, s, a, hidden, std: random_policy(0, s, a, hidden))
+    monkeypatch.setattr(policy_search, "init_baseline", lambda *_: np.zeros(1, np.float32))
     monkeypatch.setattr(algorithm, "fit_ensemble", fit)
     monkeypatch.setattr(algorithm, "improve_policy", improve)
     monkeypatch.setattr(records, "_diagnosis", lambda _, task, *rest: unknown(task.state_size, probe.HORIZON))

@@ -25,18 +25,16 @@ from metrpo.config import Config
 from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import ConfigError
 from metrpo.finite import require_finite
-from metrpo.policy import gaussian
 from metrpo.policy.inputs import folded
-from metrpo.policy.value.value_table import init_baseline
 from metrpo.run.clock import Clock
 from metrpo.run.metrics import Row
 from metrpo.seeds import Stage, key_of, rng_of
 from metrpo.stages.ensemble_fit import fit_ensemble, fresh_networks
 from metrpo.stages.log import Log, Unkept, left_out
-from metrpo.stages.policy_search import improve_policy
 from metrpo.stages.proven import prove, settle, steps_kept_for_proof
 from metrpo.stages.real_steps import collect
 from metrpo.stages.records import NOTHING, Done, Real, record
+from metrpo.stages.search import SEARCHES, improve_policy
 from metrpo.stages.state import Proven, State, inputs_for
 from metrpo.types import Episode
 from metrpo.world import dataset as datasets
@@ -60,16 +58,14 @@ def init(config: Config, task: Task) -> State:
             f"{task.name}: expected an environment for validate.rule real and imagine.start reset, got none"
         )
     policy_key, ensemble_key = jax.random.split(key_of(config.seed, 0, Stage.INIT))
-    policy = gaussian.init(
-        policy_key, task.state_size, task.action_size, config.policy.hidden, config.policy.initial_std
-    )
+    policy, baseline = SEARCHES[config.improver].fresh(config, task, policy_key)
     return State(
         iteration=0,
         real_steps=0,
         policy=policy,
         previous_policy=policy,
         networks=fresh_networks(config, task, ensemble_key),
-        baseline=init_baseline(config.advantage, task.state_size, key_of(config.seed, 0, Stage.IMPROVE)),
+        baseline=baseline,
         dataset=_logged(config, task),
         proven=Proven(policy, 0.0, 0.0, 0),
     )

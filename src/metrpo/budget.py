@@ -15,7 +15,8 @@ def steps_left(config: Config, real_steps: int) -> float:
 
 def steps_wanted(config: Config, real_steps: int) -> int:
     """Real steps that the next iteration collects: as many as the settings say, or what is left of the budget."""
-    return int(min(config.collect.steps, steps_left(config, real_steps)))
+    first = config.actor_critic.random_steps if config.improver == "actor-critic" and not real_steps else 0
+    return int(min(max(config.collect.steps, first), steps_left(config, real_steps)))
 
 
 def finished(config: Config, iteration: int, real_steps: int) -> bool:

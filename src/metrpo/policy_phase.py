@@ -5,9 +5,10 @@ The paper's Algorithm 2, lines 6 to 10 (section 5, "Policy Optimization" and "Po
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache, partial
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -49,6 +50,8 @@ class PhaseInfo(NamedTuple):
     """Mean over the updates."""
     diverged: float
     """Share of imagined rollouts, mean over the updates."""
+    more: Mapping[str, float] = MappingProxyType({})
+    """What else is to stand in the row of metrics."""
 
 
 class Starts(NamedTuple):
@@ -209,7 +212,7 @@ def _compiled_updates(
         def update(
             carry: tuple[Policy, Memory], given: tuple[Float[Array, "N S"], Key[Array, ""]]
         ) -> tuple[tuple[Policy, Memory], tuple[ImproveInfo, ImagineInfo]]:
-            policy, memory, infos = improver(settings, partial(_simulate, simulator), *carry, *given)
+            policy, memory, infos = improver(settings, partial(simulate, simulator), *carry, *given)
             return (policy, memory), infos
 
         (policy, memory), infos = jax.lax.scan(update, (policy, memory), (starts, keys))
@@ -220,7 +223,7 @@ def _compiled_updates(
     return after
 
 
-def _simulate(
+def simulate(
     simulator: Simulator, act: SampleActions, starts: Float[Array, "N S"], key: Key[Array, ""]
 ) -> tuple[Trajectories, ImagineInfo]:
     """Imagined episodes as the policy sees them."""

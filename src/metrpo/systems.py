@@ -25,6 +25,24 @@ _SVG: Overrides = {
 }
 """Networks, batch and step size of the model: the paper, appendix "Baselines"."""
 
+ACTOR_CRITIC: Overrides = {
+    "improver": "actor-critic",
+    "advantage.discount": 0.99,
+    "collect.piece": 50,
+    "collect.steps": 1000,
+    "collect.validation_fraction": 0.1,
+    "evaluation_episodes": 5,
+    "fit.max_steps": 1000,
+    "imagine.start": "anywhere",
+    "iterations": 50,
+    "policy.hidden": (256, 256),
+    "policy.normalise": True,
+    "validate.real_episodes": 0,
+    "validate.rule": "no_early",
+    "validate.starts": 10,
+}
+"""For episodes of 1,000 steps (docs/actor-critic.md)."""
+
 SYSTEMS: dict[str, Overrides] = {
     "me-trpo": {},
     # Figure "num_models-comparison": the size of the ensemble (5 is me-trpo).
@@ -63,6 +81,8 @@ SYSTEMS: dict[str, Overrides] = {
     "ddpg": {"method": "ddpg", "iterations": 60, "collect.steps": 5_000},
     "svg-1": _SVG | {"svg.horizon": "1"},
     "svg-inf": _SVG,
+    # Not the paper's: an off-policy actor-critic in the ensemble, for long episodes.
+    "actor-critic": ACTOR_CRITIC,
 }
 
 PAPER: dict[str, Overrides] = {

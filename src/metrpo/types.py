@@ -68,13 +68,15 @@ class Trajectories(NamedTuple):
     """The states after the last step."""
     going_on: Float[Array, "N"] = None
     """1 where the episode has neither ended nor diverged by then."""
+    noted: Any = None
+    """[T, N, ...], a pytree: what the policy said besides its actions."""
 
 
 RewardFormula = Callable[[Array, Array, Array], Array]
 """r(s, a, s'): [..., S], [..., A], [..., S] -> [...]; `a` within [-1, 1]; NumPy or JAX arrays alike."""
 EndFormula = Callable[[Array], Array]
 """Whether an episode ends in s': [..., S] -> [...] of bool."""
-SampleActions = Callable[[Float[Array, "N S"], Key[Array, ""]], Float[Array, "N A"]]
-"""(states, key) -> actions."""
+SampleActions = Callable[[Float[Array, "N S"], Key[Array, ""]], Any]
+"""(states [N, S], key) -> actions [N, A], or a pair of these and what is to be noted with them (a pytree, [N, ...])."""
 Simulate = Callable[[SampleActions, Float[Array, "N S"], Key[Array, ""]], tuple[Trajectories, Any]]
 """(act, start states, key) -> imagined episodes, and what they looked like."""

@@ -15,7 +15,7 @@ import probe
 from metrpo import algorithm, seeds, training
 from metrpo.config import Config
 from metrpo.presets import override
-from metrpo.stages import ensemble_fit, policy_search, real_steps, records
+from metrpo.stages import actor_critic_search, ensemble_fit, policy_search, real_steps, records
 
 TINY = override(
     Config(task="Probe", iterations=2, evaluation_episodes=2),
@@ -33,6 +33,13 @@ TINY = override(
         "advantage.value_steps": 5,
     },
 )
+BRIEFLY = {
+    "actor_critic.batch_size": 4,
+    "actor_critic.block": 2,
+    "actor_critic.critic_hidden": (4,),
+    "actor_critic.random_steps": 40,
+    "actor_critic.updates_per_step": 0.1,
+}
 DRAWS = ("normal", "uniform", "randint", "permutation")
 """All that the package draws with; `test_nothing_else_draws` sees to that."""
 
@@ -99,6 +106,7 @@ def _compiled_anew():
     [
         {"learn_reward": True, "imagine.horizon": 7, "advantage.baseline": "network", "advantage.discount": 0.9},
         {"imagine.sampling": "model_mean_std", "improver": "ppo"},
+        {"improver": "actor-critic", "advantage.discount": 0.9, **BRIEFLY},
     ],
     ids=lambda options: ", ".join(map(str, options.values())),
 )
@@ -113,7 +121,7 @@ def test_nothing_random_is_used_twice(options, monkeypatch):
 
         return make
 
-    stages = (algorithm, ensemble_fit, policy_search, real_steps, records)
+    stages = (algorithm, actor_critic_search, ensemble_fit, policy_search, real_steps, records)
     for name in ("rng_of", "key_of"):
         for module in stages:
             if hasattr(module, name):

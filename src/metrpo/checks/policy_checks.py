@@ -152,8 +152,8 @@ def few_episodes(rows: Sequence[Row], config: Config) -> Concern | None:
 
 def std_collapsed(rows: Sequence[Row], config: Config) -> Concern | None:
     """The policy hardly explores any more."""
-    if config.method == "ddpg":
-        return None  # its noise is not the policy's
+    if config.method == "ddpg" or config.improver == "actor-critic":
+        return None  # the noise of one is not the policy's, that of the other steered by its entropy
     std = column(rows, "mean_std")
     since = since_when(rows, std < COLLAPSED * config.policy.initial_std)
     if since is None:

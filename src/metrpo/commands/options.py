@@ -30,15 +30,16 @@ class RunOptions(Config):
     """The defaults of all other settings. fast: learns soonest on two CPU cores; paper: the paper's values;
     long-horizon: for tasks of 1,000 steps."""
     system: Annotated[System, arg(metavar="NAME")] = "me-trpo"
-    """The method: me-trpo, or one to compare it with. trpo, ppo, ddpg, svg-1 and svg-inf learn without the ensemble;
-    trpo, ppo and ddpg learn from real steps only (ppo and ddpg are Stable-Baselines3's). The others, such as
-    model-ppo and k-1, change a few settings of me-trpo."""
+    """The method: me-trpo; actor-critic, for long episodes; or one to compare these with. trpo, ppo, ddpg, svg-1 and
+    svg-inf learn without the ensemble; trpo, ppo and ddpg learn from real steps only (ppo and ddpg are
+    Stable-Baselines3's). The others, such as model-ppo and k-1, change a few settings of me-trpo."""
     method: Annotated[Method, arg(metavar="NAME")] = "model-based"
     """The training loop, which --system chooses: model-based (the paper's), or a baseline: trpo, svg, or
     Stable-Baselines3's ppo and ddpg."""
     improver: ImproverName = "trpo"
-    """How to improve the policy on imagined steps: by score functions (trpo, ppo, vpg) or by backpropagation through
-    the models (bptt). This ppo learns in the ensemble; --ppo.clip and the like are its settings."""
+    """How to improve the policy on imagined steps: by score functions (trpo, ppo, vpg), by backpropagation through
+    the models (bptt), or by critics and backpropagation (actor-critic). This ppo learns in the ensemble; --ppo.clip
+    and the like are its settings."""
     iterations: int = 10
     """The budget: outer iterations. Raise it later to continue a finished run."""
     real_steps: Annotated[int | None, arg(metavar="INT")] = None

@@ -2,6 +2,7 @@
 
 from metrpo.config.schema import (
     BUDGET_FIELDS,
+    ActorCriticConfig,
     AdvantageConfig,
     CollectConfig,
     Config,
@@ -24,6 +25,7 @@ from metrpo.config.serialise import ADDED, convert, difference, flatten, from_js
 __all__ = [
     "ADDED",
     "BUDGET_FIELDS",
+    "ActorCriticConfig",
     "AdvantageConfig",
     "CollectConfig",
     "Config",

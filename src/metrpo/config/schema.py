@@ -6,6 +6,7 @@ The defaults are the paper's values (its appendix A.1) or, where it is silent, i
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -32,6 +33,9 @@ class CollectConfig:
     """Scale of the parameter noise: std = scale * |policy - previous policy|, redrawn every episode; 0: none."""
     validation_fraction: float = 1 / 3
     """Fraction of the new episodes that goes to the validation set."""
+    piece: int | None = None
+    """Cut episodes into pieces of at most so many steps, of which a fraction goes to the validation set; None: whole
+    episodes go there (the paper)."""
     max_train: int = 200_000
     """Maximum number of transitions kept for training; the oldest go first."""
     max_validation: int = 100_000
@@ -56,6 +60,7 @@ class CollectConfig:
             self.validation_fraction,
             "between 0 and 1, both excluded",
         )
+        require(self.piece is None or self.piece >= 1, "collect.piece", self.piece, "at least 1")
         require(self.max_train >= 1, "collect.max_train", self.max_train, "at least 1")
         require(self.max_validation >= 1, "collect.max_validation", self.max_validation, "at least 1")
 
@@ -280,6 +285,72 @@ class SVGConfig:
 
 
 @dataclass(frozen=True)
+class ActorCriticConfig:
+    """The off-policy actor-critic in the ensemble, for `improver = "actor-critic"` (docs/actor-critic.md).
+
+    Its actor is of `policy.hidden` and learns by `gradient`; its discount is `advantage.discount`.
+    """
+
+    updates_per_step: float = 1.0
+    """Updates of actor and critics for every real step collected."""
+    random_steps: int = 3000
+    """Real steps of uniformly random actions, at least, which the first iteration collects."""
+    batch_size: int = 256
+    """States from which an update imagines."""
+    real_batch: int = 256
+    """Real transitions from which the critics learn in every update, besides imagined ones."""
+    horizon: int = 5
+    """Steps that an update imagines: for the critics' targets, and for the actor's gradient through the models. 0:
+    none, the critics learn from real transitions alone (soft actor-critic)."""
+    branch_steps: int = 20
+    """Steps imagined from states of the dataset; updates start in the states that these reach."""
+    trust: float = 1.0
+    """These are cut where members disagree by more than this times their disagreement on 95 % of the held-out data; 0:
+    never."""
+    margin: float = 0.25
+    """Imagined states, their changes and learned rewards stay within the data's range, and this times it beyond."""
+    block: int = 50
+    """Updates in one compiled call; the states that they start in are imagined afresh for each."""
+    critics: int = 2
+    """Networks that value states and actions; the least of their targets counts."""
+    critic_hidden: tuple[int, ...] = (256, 256)
+    """Sizes of a critic's hidden layers (SiLU, normalised)."""
+    critic_learning_rate: float = 3e-4
+    """Adam's step size for the critics."""
+    critic_steps: int = 1
+    """The first so many states of an imagined episode are what critics learn from, each valued by all that follows."""
+    target_rate: float = 0.005
+    """Share of the critics that goes into their moving average, the targets, at every update."""
+    entropy_weight: float = 0.1
+    """What a nat of the actor's entropy is worth in rewards, at first."""
+    entropy_target: float = -1.0
+    """Nats for each action towards which that weight steers the entropy."""
+    entropy_learning_rate: float = 3e-4
+    """Adam's step size for the logarithm of that weight."""
+    terminal: Literal["mean", "min"] = "mean"
+    """How the critics value the actor's last imagined state: by their mean or their minimum."""
+
+    def __post_init__(self) -> None:
+        name = "actor_critic"
+        for field_ in ("updates_per_step", "critic_learning_rate", "entropy_weight", "entropy_learning_rate"):
+            value = getattr(self, field_)
+            require(positive(value), f"{name}.{field_}", value, "a finite number > 0")
+        for field_ in ("batch_size", "branch_steps", "block", "critics", "critic_steps"):
+            require(getattr(self, field_) >= 1, f"{name}.{field_}", getattr(self, field_), "at least 1")
+        require(self.horizon >= 0, f"{name}.horizon", self.horizon, "at least 0")
+        least = 0 if self.horizon else 1
+        require(self.real_batch >= least, f"{name}.real_batch", self.real_batch, f"at least {least}")
+        require(nonnegative(self.trust), f"{name}.trust", self.trust, "a finite number >= 0")
+        require(self.random_steps >= 0, f"{name}.random_steps", self.random_steps, "at least 0")
+        require(nonnegative(self.margin), f"{name}.margin", self.margin, "a finite number >= 0")
+        hidden = self.critic_hidden
+        require(all(n >= 1 for n in hidden), f"{name}.critic_hidden", hidden, "sizes of at least 1")
+        require(0 < self.target_rate <= 1, f"{name}.target_rate", self.target_rate, "above 0 and at most 1")
+        target = self.entropy_target
+        require(math.isfinite(target), f"{name}.entropy_target", target, "a finite number")
+
+
+@dataclass(frozen=True)
 class ValidateConfig:
     """When to stop improving the policy (paper, section 5, "Policy validation")."""
 
@@ -333,14 +404,15 @@ System = Literal[
     "ddpg",
     "svg-1",
     "svg-inf",
+    "actor-critic",
 ]
-"""Names of the systems that the paper compares."""
+"""Names of the systems: those that the paper compares, and the actor-critic."""
 
 Method = Literal["model-based", "trpo", "ppo", "ddpg", "svg"]
 """The training loops: model-based, or a baseline in the real environment."""
 
-ImproverName = Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic"]
-"""The rows of `metrpo.policy.improvers.improver_table.IMPROVERS`."""
+ImproverName = Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic", "actor-critic"]
+"""The rows of `metrpo.stages.search.SEARCHES`."""
 
 Preset = Literal["fast", "paper", "long-horizon"]
 """Names of the presets (see `metrpo.presets`)."""
@@ -375,7 +447,7 @@ class Config:
     improver: ImproverName = "trpo"
     """How to improve the policy on imagined steps: by the score function (trpo, ppo, vpg), or by backpropagation
     through the models with the mean action (bptt) or reparametrised samples (bptt-stochastic). This ppo is ours; the
-    system ppo is Stable-Baselines3's."""
+    system ppo is Stable-Baselines3's. actor-critic: off-policy, without validation (`actor_critic`)."""
     learn_reward: bool = False
     """Learn the reward and the end of episodes even where the task has formulas for them."""
     trust_reward: bool = False
@@ -402,6 +474,7 @@ class Config:
     gradient: GradientConfig = field(default_factory=GradientConfig)
     ppo: PPOConfig = field(default_factory=PPOConfig)
     svg: SVGConfig = field(default_factory=SVGConfig)
+    actor_critic: ActorCriticConfig = field(default_factory=ActorCriticConfig)
     validate: ValidateConfig = field(default_factory=ValidateConfig)
 
     def __post_init__(self) -> None:

@@ -45,6 +45,8 @@ ADDED = (
     "config.history",
     "config.learn_reward",
     "config.trust_reward",
+    "config.collect.piece",
+    "config.actor_critic",
 )
 """Settings newer than the first config.json files: where one is missing, the run used its default."""
 

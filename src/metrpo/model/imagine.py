@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Key
 
 from metrpo.devices import across, is_spread, share_of, sharers
 from metrpo.limits import NONE, Limits
+from metrpo.model.bounds import Bounds, bounded
 from metrpo.model.ensemble import Ensemble, Predictor, predict, predict_delta
 from metrpo.model.model_parallel import can_share, shared
 from metrpo.model.sampling import SAMPLINGS, Keys, for_all
@@ -61,6 +62,10 @@ class Simulator:
     """How the policy sees the states; None: as they are."""
     limits: Limits = field(default=NONE, metadata={"static": True})
     """What its actions are held to."""
+    bounds: Bounds | None = None
+    """What predictions are brought within; None: anything goes."""
+    trusted: Float[Array, ""] | None = None
+    """Episodes are cut after a step in which the models disagree by more than this; None: never."""
 
     def nothing_before(self, *rows: int) -> Array | None:
         """The actions before the first step, [*rows, A]; None where they do not matter."""
@@ -126,17 +131,22 @@ def imagine(
     def step(carry: _Going, key: Key[Array, ""]) -> tuple[_Going, Trajectories]:
         states, alive, diverged, before = carry
         action_key, model_key = jax.random.split(key)
-        actions = act(states, action_key)
+        acted = act(states, action_key)
+        actions, noted = acted if isinstance(acted, tuple) else (acted, None)
         clipped = simulator.limits.within(actions, before)
         predicted = sampling.draw(models, states, clipped, Keys(model_key, episode_key))
+        if simulator.bounds is not None:
+            predicted = bounded(simulator.bounds, states, predicted)
         following, rewards, ended = outcome(simulator.reward, simulator.terminated, states, clipped, predicted)
         if bonus:
             rewards = rewards + bonus * disagreement(models, states, clipped)
         bad = ~_sound(following, rewards)
-        recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive)
+        recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive, noted=noted)
         diverged = diverged | (bad & (alive > 0))
         if ended is not None:
             alive = alive * (1.0 - ended)
+        if simulator.trusted is not None:
+            alive = alive * (disagreement(models, states, clipped) <= simulator.trusted)
         # A diverged rollout stands still, so that it stays finite; it is masked below.
         following = jnp.where(bad[:, None], states, following)
         return (following, alive, diverged, None if before is None else clipped), recorded
@@ -184,6 +194,8 @@ def returns_per_model(
         states, alive, total, before = carry
         actions = simulator.limits.within(act(states), before)
         predicted = predict(ensemble, states, actions)
+        if simulator.bounds is not None:
+            predicted = bounded(simulator.bounds, states, predicted)
         following, rewards, ended = outcome(simulator.reward, simulator.terminated, states, actions, predicted)
         if bonus:
             flat = (x.reshape(-1, x.shape[-1]) for x in (states, actions))

@@ -57,9 +57,21 @@ def _needs(config: Config, task: Task) -> list[Need]:
             Need("fit.batch_size", config.fit.batch_size, "the minibatches of a step", batch),
             Need("validate.starts", config.validate.starts, "the start states of validation", starts),
         ]
-        if config.advantage.baseline == "network":
+        if config.improver == "actor-critic":
+            needs += _actor_critic_needs(config, task)
+        elif config.advantage.baseline == "network":
             needs.append(Need("advantage.value_hidden", config.advantage.value_hidden, "the value network", value))
     return needs
+
+
+def _actor_critic_needs(config: Config, task: Task) -> list[Need]:
+    a, row = config.actor_critic, 2 * task.state_size + task.action_size
+    critics = a.critics * _weights((task.state_size + task.action_size, *a.critic_hidden, 1)) * _FLOAT * _COPIES
+    states = a.batch_size * max(a.horizon * row, a.block * task.state_size) * _FLOAT
+    return [
+        Need("actor_critic.critic_hidden", a.critic_hidden, "the critics' weights", critics),
+        Need("actor_critic.batch_size", a.batch_size, "imagined transitions", states),
+    ]
 
 
 def _weights(sizes: tuple[int, ...]) -> int:

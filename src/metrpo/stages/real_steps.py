@@ -4,27 +4,20 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
-from functools import partial
-
-import jax
-import numpy as np
 
 from metrpo import budget
 from metrpo.config import Config
 from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import EpisodeError, NotFiniteError
 from metrpo.finite import naming
-from metrpo.policy import gaussian
-from metrpo.policy.gaussian import Policy
-from metrpo.policy.inputs import Inputs, folded, unfolded
 from metrpo.seeds import Stage, rng_of
 from metrpo.stages.log import Log, Unkept, left_out
-from metrpo.stages.state import State, inputs_for, on_host
+from metrpo.stages.search import SEARCHES
+from metrpo.stages.state import State
 from metrpo.types import Episode
 from metrpo.world import collection as real
-from metrpo.world.origin import of_real
 from metrpo.world.task import Task
 
 
@@ -56,7 +49,7 @@ def collect(
         number = len(episodes) + left_out(log)
         try:
             with naming("collect", state.iteration + 1):
-                explorer = _explorer(config, task, state)
+                explorer = SEARCHES[config.improver].explorer(config, task, state)
                 # Each episode has randomness of its own, so that it is the same one after any interruption.
                 rngs = (rng_of(config.seed, state.iteration + 1, Stage.COLLECT, n) for n in itertools.count(number))
                 steps = sum(len(e.rewards) for e in episodes)
@@ -66,18 +59,6 @@ def collect(
         except EpisodeError as error:
             _note_failure(log, len(episodes) + left_out(log), error)
     return episodes
-
-
-def _explorer(config: Config, task: Task, state: State) -> Callable[[np.random.Generator], real.Act]:
-    """What acts in an episode: the policy with noise on its parameters and its actions, drawn anew for each."""
-    inputs = inputs_for(config, task, state.dataset)
-    policies = on_host(state.policy), on_host(state.previous_policy)
-
-    def act(rng: np.random.Generator) -> real.Act:
-        mean = perturbed(*policies, config.collect.parameter_noise, rng, inputs)
-        return real.explore(of_real(mean, state.origin), config.collect, rng)
-
-    return act
 
 
 def _take(played: Iterator[Episode], episodes: list[Episode], enough: int, log: Log, progress: Progress) -> None:
@@ -99,20 +80,3 @@ def _note_failure(log: Log, number: int, error: EpisodeError) -> None:
     if not hopeless:
         raise error
     real.leave_out(sum(failures.values()), error)
-
-
-def perturbed(
-    policy: Policy, previous: Policy, scale: float, rng: np.random.Generator, inputs: Inputs | None = None
-) -> real.Act:
-    """The mean action of the policy with its parameters perturbed (paper, appendix A.1.1).
-
-    Those that act on normalised states: an offset of the states would blow up the noise of raw ones.
-    """
-    if inputs is not None:
-        policy, previous = unfolded(policy, inputs), unfolded(previous, inputs)
-
-    def noisy(now: np.ndarray, before: np.ndarray) -> np.ndarray:
-        return now + scale * np.abs(now - before) * rng.standard_normal(now.shape)
-
-    perturbed = policy._replace(layers=jax.tree.map(noisy, policy.layers, previous.layers))
-    return partial(gaussian.mean, perturbed if inputs is None else folded(perturbed, inputs))

@@ -152,7 +152,7 @@ def record(config: Config, task: Task, state: State, done: Done) -> Row:
     row |= {"failed_episodes": done.failed, "failed_evaluation": failed_evaluation(task, returns)}
     row |= {"unfit_dimensions": recorded("unfit_dimensions", iteration, unfit, math.nan)}
     shares = {f"improved_{k}": float(share) for k, share in enumerate(done.improved.improved)}
-    return row | diagnosis.row() | shares | trust
+    return row | diagnosis.row() | shares | trust | dict(done.improved.more)
 
 
 def _outcome(state: State, returns: np.ndarray, done: Done, cut: bool) -> Row:

@@ -46,7 +46,7 @@ def add(
     learned: tuple[str, ...] = (),
     carried: tuple[int, ...] = (),
 ) -> Dataset:
-    """The dataset with `episodes` added, a share of them (whole ones) to the validation set.
+    """The dataset with `episodes` added, a share of them (whole ones, or whole pieces) to the validation set.
 
     `learned` names what is to be predicted besides the state (`Task.learned`); the part of the state that is `carried`
     over (`Task.carried`) is not.
@@ -58,6 +58,9 @@ def add(
         seen = np.concatenate([e.states for e in episodes])
         # What is copied from state to state must not change by where it is counted from.
         origin = tied(origin_of(seen[:, : seen.shape[1] - len(carried)]), carried)
+    starts = [_counted_from(origin, e)[:1].astype(np.float32) for e in episodes]
+    if config.piece is not None:
+        episodes = [part for e in episodes for part in pieces(e, config.piece)]
     order = rng.permutation(len(episodes))
     held_out = min(max(1, round(config.validation_fraction * len(episodes))), len(episodes) - 1)
     validation = [episodes[i] for i in order[:held_out]]
@@ -67,9 +70,24 @@ def add(
     return Dataset(
         append(dataset.train, train, config.max_train, learned, origin, carried),
         append(dataset.validation, validation, config.max_validation, learned, origin, carried),
-        np.concatenate([dataset.starts, *(_counted_from(origin, e)[:1].astype(np.float32) for e in episodes)]),
+        np.concatenate([dataset.starts, *starts]),
         origin,
     )
+
+
+def pieces(episode: Episode, longest: int) -> list[Episode]:
+    """The episode cut into parts of at most `longest` steps, as episodes of their own."""
+    length = len(episode.rewards)
+    firsts = range(0, length, longest)
+    return [
+        Episode(
+            episode.states[i : min(i + longest, length) + 1],
+            episode.actions[i : i + longest],
+            episode.rewards[i : i + longest],
+            episode.terminated and i + longest >= length,
+        )
+        for i in firsts
+    ]
 
 
 def with_capacity(transitions: Transitions, most: int) -> Transitions:

@@ -1,0 +1,201 @@
+"""The actor-critic's stage: what acts in real episodes, and the updates in the fitted ensemble.
+
+In place of `metrpo.stages.policy_search` where `improver` is "actor-critic". The state's `baseline` holds all that the
+updates hand on (`policy.improvers.actor_critic.Learner`), its `policy` what the actor does without noise.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from metrpo import budget
+from metrpo.actor_critic_phase import branches, run_block
+from metrpo.config import Config
+from metrpo.console.progress import Progress
+from metrpo.errors import ConfigError
+from metrpo.model.bounds import bounds_of
+from metrpo.model.ensemble import Ensemble, with_carried
+from metrpo.model.imagine import ImagineInfo, Simulator, disagreement, outcome
+from metrpo.policy import gaussian, squashed
+from metrpo.policy.gaussian import Policy
+from metrpo.policy.improvers import actor_critic
+from metrpo.policy.improvers.actor_critic import Learner, Steps, UpdateInfo, UpdateSettings
+from metrpo.policy.inputs import Inputs, normalised
+from metrpo.policy.stopping import improved
+from metrpo.policy.value.critics import Scale, rescaled, scale_of
+from metrpo.policy_phase import PhaseInfo, simulator_of, values_of
+from metrpo.run.clock import Clock
+from metrpo.seeds import Stage, key_of, rng_of
+from metrpo.stages.state import State, inputs_for
+from metrpo.types import Array
+from metrpo.world import collection as real
+from metrpo.world.dataset import Dataset
+from metrpo.world.origin import of_real, shifted
+from metrpo.world.task import Task
+
+_LOOKED_AT = 1000
+"""States of the dataset, the newest, on which the policy is described for the record."""
+_COMPARED, _MOST = 1000, 0.95
+"""Held-out steps, and the share of them, that decide how far models are trusted."""
+_disagreement = jax.jit(disagreement)
+_NEAR = 0.99
+"""Mean actions of a squashed policy beyond this saturate."""
+
+
+def fresh(config: Config, task: Task, key: Array) -> tuple[Policy, Learner]:
+    """A policy and a learner that have learned nothing.
+
+    Raises `ConfigError` without a discount, on which the values' scale rests.
+    """
+    if config.advantage.discount >= 1:
+        got = config.advantage.discount
+        raise ConfigError(
+            f"advantage.discount: expected less than 1 with improver actor-critic (0.995, say), got {got}"
+        )
+    sizes = task.state_size, task.action_size, config.policy.hidden
+    learner = actor_critic.init(UpdateSettings.of(config), key, *sizes)
+    policy = squashed.mean_policy(learner.actor, None, np.zeros((0, task.state_size), np.float32))
+    return jax.tree.map(jnp.asarray, policy), learner
+
+
+def explorer(config: Config, task: Task, state: State) -> Callable[[np.random.Generator], real.Act]:
+    """What acts in an episode: uniformly random actions at first, then the actor."""
+    inputs, actor = inputs_for(config, task, state.dataset), squashed.on_host(state.baseline.actor)
+    at_random = state.iteration == 0
+
+    def draw_act(rng: np.random.Generator) -> real.Act:
+        def act(observed: np.ndarray) -> np.ndarray:
+            if at_random:
+                return rng.uniform(-1.0, 1.0, task.action_size)
+            return squashed.draw(actor, observed if inputs is None else normalised(inputs, observed), rng)
+
+        return of_real(act, state.origin)
+
+    return draw_act
+
+
+def improve_policy(
+    config: Config, task: Task, state: State, ensemble: Ensemble, progress: Progress, clock: Clock
+) -> tuple[Policy, Learner, PhaseInfo]:
+    """The policy after an iteration's updates, the learner and what happened.
+
+    `state` holds the dataset that the ensemble was fitted to.
+    """
+    iteration, dataset, settings = state.iteration + 1, state.dataset, UpdateSettings.of(config)
+    rng, key = rng_of(config.seed, iteration, Stage.IMPROVE), key_of(config.seed, iteration, Stage.IMPROVE)
+    known, inputs = shifted(task, dataset.origin), inputs_for(config, task, dataset)
+    bounds = bounds_of(dataset.train, config.actor_critic.margin, task.unseen)
+    simulator = dataclasses.replace(
+        simulator_of(config, known, ensemble, inputs), bounds=bounds, trusted=_trusted(config, ensemble, dataset, rng)
+    )
+    real_steps = _real_steps(known, ensemble, dataset)
+    before = learner = _in_units(state, scale_of(real_steps.rewards, settings.discount, bool(task.terminated)))
+    real_steps = _seen(inputs, real_steps)
+    infos: list[tuple[UpdateInfo, ImagineInfo]] = []
+    block, blocks = config.actor_critic.block, _blocks(config, state.real_steps)
+    for number in range(blocks):
+        starts = dataset.train.states[rng.integers(dataset.train.size, size=branches(settings, block))]
+        rows = rng.integers(dataset.train.size, size=(block, config.actor_critic.real_batch))
+        steps = jax.tree.map(lambda x, rows=rows: x[rows], real_steps)
+        keys = jax.random.split(jax.random.fold_in(key, number), block)
+        learner, happened = run_block(settings, simulator, learner, starts, steps, keys)
+        infos.append(jax.device_get(happened))
+        progress.update((number + 1) * block, _note(infos[-1][0]))
+    learner = jax.device_get(learner)
+    updates, imagined = jax.tree.map(lambda *xs: np.concatenate(xs), *infos)
+    seen = dataset.train.states[-_LOOKED_AT:]
+    policies = [squashed.mean_policy(x.actor, inputs, seen) for x in (before, learner)]
+    with clock("validate"):
+        values = _values(config, simulator, policies, dataset.starts)
+    shown = seen if inputs is None else normalised(inputs, seen)
+    info = PhaseInfo(
+        values=values[1],
+        updates=blocks * block,
+        accepted_updates=blocks * block,
+        rejected_steps=int(np.sum(~updates.accepted)),
+        validations=1,
+        improved=improved(values[1], values[0]).astype(np.float64),
+        kl=float(np.mean(squashed.kl(squashed.on_host(before.actor), learner.actor, shown))) / (blocks * block),
+        diverged=float(np.mean(imagined.diverged)),
+        more=_columns(updates, learner, policies[1], seen),
+    )
+    return policies[1], learner, info
+
+
+def _blocks(config: Config, real_steps: int) -> int:
+    """Blocks of updates in the iteration that begins after `real_steps`."""
+    updates = config.actor_critic.updates_per_step * (budget.steps_wanted(config, real_steps) or config.collect.steps)
+    return max(1, round(updates / config.actor_critic.block))
+
+
+def _in_units(state: State, scale: Scale) -> Learner:
+    """The learner with critics in the units of the data as they are now."""
+    learner: Learner = state.baseline
+    if state.iteration == 0:  # it says the middle of what is possible, whatever that turns out to be
+        return learner._replace(scale=scale)
+    critics, targets = (rescaled(x, learner.scale, scale) for x in (learner.critics, learner.targets))
+    return learner._replace(critics=critics, targets=targets, scale=scale)
+
+
+def _real_steps(task: Task, ensemble: Ensemble, dataset: Dataset) -> Steps:
+    """The transitions to learn from, in raw states."""
+    states, actions, deltas, _ = dataset.train
+    size = states.shape[1] - len(ensemble.carried.indices)
+    changing = np.concatenate([states[:, :size] + deltas[:, :size], deltas[:, size:]], axis=1)
+    predicted = np.asarray(with_carried(ensemble, states, actions, changing))
+    following, rewards, ended = outcome(task.reward, task.terminated, states, actions, predicted)
+    going_on = np.ones(len(states)) if ended is None else 1.0 - np.asarray(ended)
+    return Steps(states, actions, np.asarray(rewards, np.float32), following, going_on.astype(np.float32))
+
+
+def _seen(inputs: Inputs | None, steps: Steps) -> Steps:
+    """The same steps in states as the actor sees them."""
+    if inputs is None:
+        return steps
+    return steps._replace(states=normalised(inputs, steps.states), following=normalised(inputs, steps.following))
+
+
+def _trusted(config: Config, ensemble: Ensemble, dataset: Dataset, rng: np.random.Generator) -> Array | None:
+    """The disagreement, [], beyond which branches are cut: what the models have on real steps that they did not see."""
+    if not config.actor_critic.trust:
+        return None
+    rows = rng.integers(dataset.validation.size, size=_COMPARED)
+    real = _disagreement(ensemble, dataset.validation.states[rows], dataset.validation.actions[rows])
+    return jnp.float32(config.actor_critic.trust * np.quantile(real, _MOST))
+
+
+def _values(config: Config, simulator: Simulator, policies: list[Policy], starts: np.ndarray) -> list[np.ndarray]:
+    """[K] for each of the `policies` of raw states: its mean return in every model, over whole episodes."""
+    rng = np.random.default_rng(0)  # the same starts for both; nothing is learned from these
+    chosen = starts[rng.integers(len(starts), size=config.validate.starts)]
+    plain = dataclasses.replace(simulator, inputs=None)
+    return [values_of(plain, policy, chosen) for policy in policies]
+
+
+def _columns(updates: UpdateInfo, learner: Learner, policy: Policy, states: np.ndarray) -> dict[str, float]:
+    """What the row of metrics says of an actor-critic alone."""
+    made = updates.accepted
+
+    def mean(values: np.ndarray) -> float:
+        return float(np.mean(values[made])) if made.any() else math.nan
+
+    actions = gaussian.mean(policy, states)
+    return {
+        "critic_loss": mean(updates.critic_loss),
+        "value": mean(updates.value),
+        "entropy": mean(updates.entropy),
+        "entropy_weight": float(np.exp(learner.log_entropy_weight)),
+        "actor_gradient_norm": mean(updates.gradient_norm),
+        "saturated": float(np.mean(np.abs(actions) > _NEAR)),
+    }
+
+
+def _note(updates: UpdateInfo) -> str:
+    value, loss, entropy = (float(np.mean(x)) for x in (updates.value, updates.critic_loss, updates.entropy))
+    return f"value {value:.4g}, critic loss {loss:.3g}, entropy {entropy:.2f}"

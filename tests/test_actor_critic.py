@@ -1,0 +1,226 @@
+"""Whole runs of the actor-critic on the probe: compilations, resuming, its files and what it learns."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+
+import jax
+import numpy as np
+import pytest
+
+import probe
+from helpers import linear_ensemble
+from metrpo import algorithm, training
+from metrpo.config import Config
+from metrpo.errors import ConfigError
+from metrpo.policy import squashed
+from metrpo.policy.inputs import normalised
+from metrpo.presets import override, preset
+from metrpo.run import directory
+from metrpo.run.files import atomic_write
+from metrpo.run.policy_export import export
+from metrpo.run.policy_file import load_policy
+from metrpo.speed.measure import compilations
+from metrpo.stages import actor_critic_search
+from metrpo.stages.state import inputs_for
+from metrpo.training import train
+
+SMALL = override(
+    Config(task="Probe", iterations=4, evaluation_episodes=1, deterministic=True, improver="actor-critic"),
+    {
+        "actor_critic.batch_size": 8,
+        "actor_critic.block": 10,
+        "actor_critic.branch_steps": 4,
+        "actor_critic.critic_hidden": (4,),
+        "actor_critic.horizon": 2,
+        "actor_critic.random_steps": 40,
+        "actor_critic.real_batch": 8,
+        "actor_critic.updates_per_step": 0.5,
+        "advantage.discount": 0.9,
+        "collect.max_train": 200,
+        "collect.max_validation": 50,
+        "collect.piece": 5,
+        "collect.steps": 20,
+        "ensemble.hidden": (4,),
+        "ensemble.members": 2,
+        "fit.batch_size": 20,
+        "fit.max_steps": 10,
+        "policy.hidden": (4,),
+        "policy.normalise": True,
+        "trust_reward": True,
+        "validate.real_episodes": 0,
+        "validate.rule": "no_early",
+        "validate.starts": 2,
+    },
+)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _probe_is_a_task():
+    with probe.registered(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(directory, "draw_curve", lambda rows, path, *_: atomic_write(path, "drawn"))
+        yield
+
+
+@pytest.fixture(scope="module")
+def small():
+    """States (the first included), rows and compilations of four iterations."""
+    jax.clear_caches()
+    states, rows, counts = [training.init(SMALL)], [], []
+    for _ in range(SMALL.iterations):
+        with compilations() as seen:
+            state, row = training.step(SMALL, states[-1])
+        states.append(state)
+        rows.append(row)
+        counts.append(len(seen))
+    return types.SimpleNamespace(states=states, rows=rows, counts=counts)
+
+
+def equal(one, other):
+    return jax.tree.all(jax.tree.map(np.array_equal, one, other))
+
+
+def test_nothing_compiles_after_the_second_iteration(small):
+    assert small.counts[0] > 5, "the count must see compilations"
+    assert small.counts[2:] == [0, 0]
+
+
+def test_an_iteration_makes_an_update_for_each_real_step_that_it_collects(small):
+    assert [row["real_steps"] for row in small.rows] == [40, 60, 80, 100]
+    assert [row["updates"] for row in small.rows] == [20, 10, 10, 10]
+
+
+def test_rows_say_what_was_learned(small):
+    for row in small.rows:
+        for name in ("critic_loss", "value", "entropy", "entropy_weight", "actor_gradient_norm", "saturated", "kl"):
+            assert np.isfinite(row[name]), name
+        assert row["rejected_steps"] == 0
+        assert 0 <= row["saturated"] <= 1
+        assert row["kl"] > 0
+    assert len({tuple(row) for row in small.rows}) == 1, "the same columns in every row"
+    weights = [float(np.exp(s.baseline.log_entropy_weight)) for s in small.states[1:]]
+    assert weights == [row["entropy_weight"] for row in small.rows]
+
+
+def test_a_step_leaves_its_state_as_it_was_and_can_be_repeated(small):
+    before = jax.tree.map(np.array, small.states[2])
+    again, _ = training.step(SMALL, small.states[2])
+    assert equal(before, small.states[2])
+    assert equal(again, small.states[3])
+
+
+def test_all_that_updates_hand_on_goes_on_in_the_next_iteration(small):
+    one, two = (s.baseline for s in small.states[2:4])
+    counts = [int(x.moments.entropy[0].count) for x in (one, two)]
+    assert counts == [30, 40], "updates that Adam has seen"
+    for before, after in zip(jax.tree.leaves(one.critics), jax.tree.leaves(two.critics), strict=True):
+        assert not np.array_equal(before, after)
+
+
+def test_a_run_that_was_resumed_is_the_run_that_never_stopped(tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    train(override(SMALL, {"iterations": 3}), whole)
+    train(override(SMALL, {"iterations": 1}), parts)
+    train(override(SMALL, {"iterations": 3}), parts)
+    for name in ("metrics.csv", "policy.npz", "checkpoints/iteration-00003.npz", "checkpoints/iteration-00002.npz"):
+        assert (whole / name).read_bytes() == (parts / name).read_bytes(), name
+    _policy_acts_as_the_actor_does(whole)
+
+
+def _policy_acts_as_the_actor_does(run_dir):
+    policy = load_policy(run_dir)
+    state = training.init(SMALL)
+    with directory.RunDirectory(run_dir, override(SMALL, {"iterations": 3})) as run:
+        state = run.load(state)
+    seen = np.random.default_rng(0).uniform(-1, 1, (9, 2)).astype(np.float32)
+    inputs = inputs_for(SMALL, probe.PROBE, state.dataset)
+    means, _ = squashed.moments(squashed.on_host(state.baseline.actor), normalised(inputs, seen))
+    np.testing.assert_allclose(policy(seen), np.tanh(means), atol=1e-5)
+    space: dict = {}
+    exec(export(run_dir).read_text().replace('__name__ == "__main__"', "True"), space)  # it checks itself
+    np.testing.assert_allclose(space["act"](seen), policy(seen), atol=1e-6)
+
+
+def test_it_acts_at_random_first_and_then_by_the_actor(small):
+    def actions(state):
+        act = actor_critic_search.explorer(SMALL, probe.PROBE, state)(np.random.default_rng(0))
+        return np.array([act(np.zeros(2)) for _ in range(300)])
+
+    first, later = actions(small.states[0]), actions(small.states[1])
+    assert np.abs(first).max() < 1
+    np.testing.assert_allclose(np.quantile(first, [0.1, 0.5, 0.9]), [-0.8, 0, 0.8], atol=0.12)
+    actor = squashed.on_host(small.states[1].baseline.actor)
+    seen = normalised(inputs_for(SMALL, probe.PROBE, small.states[1].dataset), np.zeros(2))
+    rng = np.random.default_rng(0)
+    np.testing.assert_array_equal(later, [squashed.draw(actor, seen, rng) for _ in range(300)])
+
+
+def test_real_steps_are_those_of_the_dataset_with_rewards_and_ends(small):
+    data, ensemble = small.states[1].dataset, linear_ensemble([(probe.A, probe.B)])
+    states, actions, deltas, _ = data.train
+    steps = actor_critic_search._real_steps(probe.PROBE, ensemble, data)
+    np.testing.assert_array_equal(steps.following, states + deltas)
+    np.testing.assert_allclose(steps.rewards, probe.reward(states, actions, states + deltas), rtol=1e-5)
+    assert set(steps.going_on) == {1.0}
+    ending = dataclasses.replace(probe.PROBE, terminated=lambda following: following[..., 0] > 0)
+    going_on = actor_critic_search._real_steps(ending, ensemble, data).going_on
+    np.testing.assert_array_equal(going_on, steps.following[:, 0] <= 0)
+    assert 0 < going_on.mean() < 1
+
+
+def test_models_are_trusted_as_far_as_they_agree_on_most_of_the_held_out_steps(small):
+    data = small.states[1].dataset
+    ensemble = linear_ensemble([(probe.A * factor, probe.B) for factor in (0.9, 1.1)])
+    apart = np.abs(0.1 * data.validation.states @ probe.A.T).mean(axis=1)
+
+    def trusted(trust):
+        config = override(SMALL, {"actor_critic.trust": trust})
+        return actor_critic_search._trusted(config, ensemble, data, np.random.default_rng(0))
+
+    assert np.quantile(apart, 0.85) < float(trusted(1.0)) <= apart.max() * 1.001
+    assert float(trusted(2.0)) == pytest.approx(2 * float(trusted(1.0)))
+    assert trusted(0.0) is None
+
+
+def test_without_a_discount_it_is_refused():
+    with pytest.raises(ConfigError, match=r"advantage\.discount: expected less than 1"):
+        training.init(override(SMALL, {"advantage.discount": 1.0}))
+
+
+def test_pieces_of_episodes_are_validated_on_and_only_whole_ones_are_started_from(small):
+    data = small.states[1].dataset
+    assert len(data.starts) == 2, "episodes of 20 steps"
+    assert data.validation.size + data.train.size == 40
+    assert data.validation.size % 5 == 0
+    assert data.validation.size > 0
+
+
+@pytest.mark.slow
+def test_it_finds_the_optimum_of_a_linear_system():
+    config = override(
+        preset("Probe", "fast", "actor-critic"),
+        {
+            "actor_critic.critic_hidden": (32, 32),
+            "actor_critic.random_steps": 100,
+            "actor_critic.updates_per_step": 5.0,
+            "advantage.discount": 0.95,
+            "collect.max_train": 1000,
+            "collect.max_validation": 500,
+            "collect.piece": 10,
+            "collect.steps": 100,
+            "ensemble.hidden": (16,),
+            "ensemble.members": 3,
+            "iterations": 4,
+            "policy.hidden": (16,),
+            "trust_reward": True,
+        },
+    )
+    state = training.train(config)
+    assert probe.real_return(state.policy) > 1.25 * probe.optimum()
+
+
+def test_the_system_is_the_actor_critic():
+    config = preset("Probe", "fast", "actor-critic")
+    assert (config.improver, config.method, config.policy.normalise) == ("actor-critic", "model-based", True)
+    assert algorithm.init(config, probe.PROBE).policy.layers[-1][0].shape == (2, 2)
