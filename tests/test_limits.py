@@ -80,9 +80,7 @@ def test_a_runs_task_and_simulator_have_the_runs_limits():
 @pytest.mark.parametrize(("method", "name"), [("svg", "max_action"), ("ppo", "max_action"), ("ddpg", "max_change")])
 def test_methods_that_cannot_keep_them_refuse(method, name):
     config = dataclasses.replace(preset("Swimmer"), method=method, **{name: 0.5})
-    with pytest.raises(
-        ConfigError, match=f"{name}: expected the method model-based or trpo to learn under limits, got"
-    ):
+    with pytest.raises(ConfigError, match=f"{name}: expected the system me-trpo or trpo to learn under limits, got"):
         training.init(config)
 
 

@@ -8,9 +8,11 @@ import typing
 import pytest
 
 from metrpo import systems
+from metrpo.commands.parse import parse
 from metrpo.config import Config, Preset, System, flatten, from_json, to_json
 from metrpo.errors import ConfigError
-from metrpo.presets import LONG_HORIZON_ALL, preset
+from metrpo.launch.grid import Grid
+from metrpo.presets import LONG_HORIZON_ALL, configured, preset
 from metrpo.systems import SYSTEMS
 from metrpo.world.registry import tasks
 
@@ -170,7 +172,7 @@ def test_variants_share_their_tasks_settings(variant, task, name):
 
 
 def test_long_horizon_cuts_imagined_episodes_and_values_the_rest():
-    fast, long = preset("mbbl/HalfCheetah"), preset("mbbl/HalfCheetah", "long-horizon")
+    fast, long = preset("mbbl/HalfCheetah", "fast", "me-trpo"), preset("mbbl/HalfCheetah", "long-horizon")
     assert (long.advantage.baseline, long.imagine.horizon, long.imagine.start) == ("network", 30, "anywhere")
     # The value of a cut episode leans on itself; exploration leaves the policy recognisable.
     assert long.advantage.discount < 1
@@ -184,8 +186,35 @@ def test_long_horizon_cuts_imagined_episodes_and_values_the_rest():
 
 @pytest.mark.parametrize("task", ["mbbl/HalfCheetah", "mbbl/CartPole", *TASKS])
 def test_long_horizon_changes_what_its_row_says_and_nothing_else(task):
-    fast, long = flatten(preset(task)), flatten(preset(task, "long-horizon"))
+    fast, long = flatten(preset(task, "fast", "me-trpo")), flatten(preset(task, "long-horizon"))
     assert long == fast | LONG_HORIZON_ALL | {"preset": "long-horizon"}
+
+
+@pytest.mark.parametrize(
+    ("task", "settings", "system"),
+    [
+        ("HalfCheetah-v5", {}, "actor-critic"),
+        ("mbbl/HalfCheetah", {}, "actor-critic"),
+        ("Pendulum-v1", {}, "me-trpo"),
+        ("Swimmer", {}, "me-trpo"),
+        ("HumanoidStandup", {}, "me-trpo"),
+        ("HalfCheetah-v5", {"improver": "ppo"}, "me-trpo"),
+        ("HalfCheetah-v5", {"max_change": 0.5}, "me-trpo"),
+    ],
+)
+def test_long_episodes_have_another_usual_system(task, settings, system):
+    assert preset(task, **settings).system == system
+    assert configured(task, "fast", None, settings).system == system
+    words = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
+    assert parse(["train", task, *words]).system == system
+    assert parse(["train", task, *words, "--system", "me-trpo"]).system == "me-trpo"
+    assert Grid((task,), settings={name: [value] for name, value in settings.items()}).runs()[0].system == system
+
+
+@pytest.mark.parametrize("name", ["paper", "long-horizon"])
+def test_other_presets_have_one_usual_system(name):
+    assert preset("mbbl/HalfCheetah", name).system == "me-trpo"
+    assert parse(["train", "mbbl/HalfCheetah", "--preset", name]).system == "me-trpo"
 
 
 def test_settings_on_top():

@@ -72,7 +72,7 @@ def _compiled_block(
         models: Simulator, learner: Learner, starts: Array, real: Steps, keys: Array
     ) -> tuple[Learner, tuple[UpdateInfo, ImagineInfo]]:
         beyond = dataclasses.replace(models, horizon=a.branch_steps)
-        within = dataclasses.replace(models, horizon=a.horizon, trusted=None)
+        within = dataclasses.replace(models, horizon=a.horizon)
         pool = reached(beyond, learner, starts, jax.random.fold_in(keys[0], _BRANCH))
 
         def one(learner: Learner, given: tuple[Array, Steps]) -> tuple[Learner, tuple[UpdateInfo, ImagineInfo]]:
@@ -97,7 +97,8 @@ def reached(simulator: Simulator, learner: Learner, starts: Array, key: Array) -
         return squashed.sample(learner.actor, seen, key)[0]
 
     rollouts, _ = imagine(simulator, act, starts, key)
-    return Pool(rollouts.states.reshape(-1, starts.shape[-1]), rollouts.mask.reshape(-1))
+    moved = jnp.concatenate([jnp.ones_like(rollouts.trusted[:1]), rollouts.trusted[:-1]])
+    return Pool(rollouts.states.reshape(-1, starts.shape[-1]), (rollouts.mask * moved).reshape(-1))
 
 
 def drawn(pool: Pool, count: int, key: Array) -> Array:

@@ -96,19 +96,41 @@ SAME_AS = {"HopperUpright": "Hopper", "HumanoidStandup": "Humanoid"}
 """Variants share their task's row."""
 
 
-def preset(task: str, name: str = "fast", system: str = "me-trpo", **top_level: Any) -> Config:
-    """The config of a preset for a task and one of the paper's systems, with `top_level` settings such as `seed=1`.
+LONG = 300
+"""Episodes of more steps are imagined in parts, and valued by critics where these end (docs/actor-critic.md)."""
 
-    Raises `ConfigError` for an unknown preset, system or setting.
+
+ONLY_ME_TRPO = frozenset({"improver", "method", "max_action", "max_change"})
+"""Settings that the actor-critic cannot have."""
+
+
+def usual_system(task: str, name: str, settings: Overrides) -> str:
+    """The system that a task has where none is asked for: `me-trpo`, under `fast` `actor-critic` for long episodes.
+
+    Where `settings` say how to learn, or limit the actions (`ONLY_ME_TRPO`), it is `me-trpo`.
+    """
+    from metrpo.world.registry import get_task
+
+    if name != "fast" or SAME_AS.get(task, task) in PAPER or settings.keys() & ONLY_ME_TRPO:
+        return "me-trpo"
+    return "actor-critic" if get_task(task, **_chosen(settings)).horizon > LONG else "me-trpo"
+
+
+def preset(task: str, name: str = "fast", system: str | None = None, **top_level: Any) -> Config:
+    """The config of a preset for a task and a system, with `top_level` settings such as `seed=1`.
+
+    A system of None is the task's usual one (`usual_system`). Raises `ConfigError` for an unknown preset, system or
+    setting.
     """
     if name not in typing.get_args(Preset):
         raise ConfigError(f"preset: expected one of {', '.join(typing.get_args(Preset))}, got {name!r}")
     row = SAME_AS.get(task, task)
-    chosen = {name: top_level[name] for name in _CHOOSE_ENV if name in top_level}
-    own = {} if row in PAPER else _generic(task, chosen)
+    own = {} if row in PAPER else _generic(task, _chosen(top_level))
     overrides = (PAPER.get(row, {}) if name == "paper" else FAST_ALL | FAST.get(row, {})) | own
     if name == "long-horizon":
         overrides |= LONG_HORIZON_ALL
+    if system is None:
+        system = usual_system(task, name, top_level)
     if system not in SYSTEMS:
         raise ConfigError(f"system: expected one of {', '.join(SYSTEMS)}, got {system!r}")
     overrides = overrides | SYSTEMS[system] | (SYSTEMS_PAPER.get(system, {}) if name == "paper" else {})
@@ -116,16 +138,18 @@ def preset(task: str, name: str = "fast", system: str = "me-trpo", **top_level: 
     return override(config, overrides | {"system": system} | top_level)
 
 
-_CHOOSE_ENV = ("env_kwargs", "imports")
-"""Settings that a task may need to be found, or to have its horizon."""
+def _chosen(settings: Overrides) -> Overrides:
+    """Those of the settings that a task may need to be found, or to have its horizon."""
+    return {name: settings[name] for name in ("env_kwargs", "imports") if name in settings}
 
 
-def bare(task: str, name: str, system: str, settings: Overrides) -> Config:
+def bare(task: str, name: str, system: str | None, settings: Overrides) -> Config:
     """The config of a preset, with only those of the dotted `settings` that create the environment."""
-    return preset(task, name, system, **{name: settings[name] for name in _CHOOSE_ENV if name in settings})
+    system = system or usual_system(task, name, settings)
+    return preset(task, name, system, **_chosen(settings))
 
 
-def configured(task: str, name: str, system: str, settings: Overrides) -> Config:
+def configured(task: str, name: str, system: str | None, settings: Overrides) -> Config:
     """The config of a preset with dotted `settings` on top. Raises `ConfigError` as `preset` and `override`."""
     return override(bare(task, name, system, settings), settings)
 

@@ -64,11 +64,10 @@ def init(config: Config) -> Saved:
 def _init(config: Config, task: Task) -> Saved:
     if config.method != "model-based" and (config.data is not None or config.real_steps == 0):
         raise ConfigError(f"data: expected the method model-based to learn from offline data, got {config.method}")
-    if config.method not in _LIMITED and Limits.of(config) != NONE:
+    learner = config.improver if config.improver == "actor-critic" else config.method
+    if learner not in _LIMITED and Limits.of(config) != NONE:
         limit = "max_action" if config.max_action < 1 else "max_change"
-        raise ConfigError(
-            f"{limit}: expected the method {' or '.join(_LIMITED)} to learn under limits, got {config.method}"
-        )
+        raise ConfigError(f"{limit}: expected the system me-trpo or trpo to learn under limits, got {learner}")
     require_memory(config, task)
     state: Saved = import_module(METHODS[config.method]).init(config, task)
     return state

@@ -70,6 +70,8 @@ class Trajectories(NamedTuple):
     """1 where the episode has neither ended nor diverged by then."""
     noted: Any = None
     """[T, N, ...], a pytree: what the policy said besides its actions."""
+    trusted: Float[Array, "T N"] = None
+    """0 from the first step on with which the models are not trusted: from there on the episode stands still."""
 
 
 RewardFormula = Callable[[Array, Array, Array], Array]

@@ -54,10 +54,18 @@ def test_a_model_that_explodes_keeps_a_finite_return():
     assert np.isfinite(returns_per_model(held, jnp.zeros_like, starts)).all()
 
 
-def test_an_episode_is_cut_after_a_step_in_which_members_disagree_too_much():
+def test_an_episode_stands_still_from_the_first_step_on_in_which_members_disagree_too_much():
     members = [(np.eye(2) * factor, np.zeros((2, 2))) for factor in (0.9, 1.1)]
     starts = np.array([[1, 1], [0.2, 0.2]], np.float32)  # members disagree by a tenth of the state
     simulator = Simulator(linear_ensemble(members), probe.reward, None, 3, trusted=jnp.float32(0.05))
-    imagined, _ = imagine(simulator, lambda states, key: jnp.zeros_like(states), starts, jax.random.key(0))
-    np.testing.assert_array_equal(imagined.mask, [[1, 1], [0, 1], [0, 1]])
-    np.testing.assert_array_equal(imagined.going_on, [0, 1])
+    imagined, info = imagine(simulator, lambda states, key: jnp.zeros_like(states), starts, jax.random.key(0))
+    np.testing.assert_array_equal(imagined.trusted, [[0, 1], [0, 1], [0, 1]])
+    np.testing.assert_array_equal(imagined.going_on, [1, 1])
+    np.testing.assert_array_equal(imagined.last[0], starts[0])
+    assert not np.array_equal(imagined.last[1], starts[1])
+    assert float(info.steps) == 3
+    growing = [(np.eye(2) * factor, np.zeros((2, 2))) for factor in (1.9, 2.1)]
+    wider = Simulator(linear_ensemble(growing), probe.reward, probe.beyond, 3, trusted=jnp.float32(0.06))
+    imagined, _ = imagine(wider, lambda states, key: jnp.zeros_like(states), starts * 1.2, jax.random.key(0))
+    np.testing.assert_array_equal(imagined.trusted[:, 1], [1, 1, 0])
+    np.testing.assert_array_equal(imagined.going_on, [1, 0])

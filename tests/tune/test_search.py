@@ -201,7 +201,7 @@ def test_a_file_says_the_same_as_options(tmp_path):
     typed += ["--set", "imagine.steps=500", "--trials", "30", "--seeds", "0,2", "--real-steps", "6000"]
     found = from_file(file)
     assert found == search_of(parse.parse([*typed, "--pruner", "halving"]))
-    assert found.steps == 2, "3,000 real steps in an iteration"
+    assert found.steps == 4, "1,500 real steps in an iteration"
     (one, two) = found.runs(7, {"trpo.max_kl": 0.01, "ensemble.hidden": (16, 16)})
     assert (one.name, two.name) == ("Swimmer/trial-007/seed-0", "Swimmer/trial-007/seed-2")
     assert (two.config.real_steps, two.config.imagine.steps, two.config.ensemble.hidden) == (6000, 500, (16, 16))

@@ -56,11 +56,19 @@ def _parse_run(kind: type[RunOptions], arguments: list[str], asked: str | None) 
 
     task = get_task(first.task, first.env_kwargs, first.imports).name
     of_task = {"env_kwargs": first.env_kwargs, "imports": first.imports}
-    defaults = _defaults(kind, preset(task, first.preset, first.system, **of_task))
+    defaults = _defaults(kind, preset(task, first.preset, _system(first, arguments), **of_task))
     if asked is not None:
         _show(kind, defaults, arguments[0], only)
     parsed = understood(lambda: _tyro(kind, defaults, arguments), kind, arguments)
     return dataclasses.replace(parsed, task=task)
+
+
+def _system(options: RunOptions, arguments: list[str]) -> str | None:
+    """The system that is asked for, by its name or by what only one can do; None: the task's usual one."""
+    from metrpo.presets import ONLY_ME_TRPO
+
+    asked = {word.partition("=")[0].removeprefix("--").replace("-", "_") for word in arguments}
+    return options.system if asked & {"system", *ONLY_ME_TRPO} else None
 
 
 def _defaults(kind: type[RunOptions], config: Config) -> RunOptions:

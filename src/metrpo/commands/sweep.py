@@ -45,8 +45,8 @@ class Sweep:
     [budget] and [set]."""
     tasks: Annotated[tuple[str, ...], arg(metavar="TASK...")] = ("Swimmer",)
     """Tasks, as metrpo train takes them."""
-    systems: Annotated[tuple[System, ...], arg(metavar="NAME...")] = ("me-trpo",)
-    """Systems, as metrpo train takes them."""
+    systems: Annotated[tuple[System, ...], arg(metavar="NAME...")] = ()
+    """Systems, as metrpo train takes them; default: the one that it takes for each task."""
     seeds: Annotated[tuple[str, ...], arg(metavar="SEEDS...")] = ("0:3",)
     """Seeds: numbers, ranges such as 0:5 (0 to 4), or lists such as 0,2,7."""
     iterations: Annotated[int | None, arg(metavar="INT")] = None

@@ -55,8 +55,8 @@ class Tune:
     """Outer iterations of every run; default: the preset's."""
     real_steps: Annotated[int | None, arg(metavar="INT")] = None
     """Instead of --iterations: real steps of every run."""
-    system: Annotated[System, arg(metavar="NAME")] = "me-trpo"
-    """System, as metrpo train takes it."""
+    system: Annotated[System | None, arg(metavar="NAME")] = None
+    """System, as metrpo train takes it; default: the one that it takes."""
     preset: Preset = "fast"
     """The defaults of all other settings."""
     pruner: Literal["median", "halving", "none"] = "median"

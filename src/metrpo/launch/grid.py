@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast, get_args
 from metrpo.config import BUDGET_FIELDS, Preset, System
 from metrpo.errors import ConfigError
 from metrpo.launch.run_spec import RunSpec
+from metrpo.presets import usual_system
 from metrpo.world.registry import get_task
 
 if TYPE_CHECKING:
@@ -28,7 +29,8 @@ class Grid:
     """The tasks, systems, seeds and settings to combine."""
 
     tasks: tuple[str, ...]
-    systems: tuple[str, ...] = ("me-trpo",)
+    systems: tuple[str, ...] = ()
+    """None: each task's usual one."""
     seeds: tuple[int, ...] = (0,)
     preset: Preset = "fast"
     settings: Mapping[str, Sequence[Any]] = field(default_factory=dict)
@@ -45,35 +47,36 @@ class Grid:
         Raises `ConfigError` or `TaskError`, before anything runs, for unknown settings and tasks and impossible values.
         """
         names, columns = list(self.settings), [list(values) for values in self.settings.values()]
-        if not self.tasks or not self.systems or not self.seeds or not all(columns):
-            raise ConfigError("sweep: expected at least one task, system, seed and value of each setting, got none")
+        if not self.tasks or not self.seeds or not all(columns):
+            raise ConfigError("sweep: expected at least one task, seed and value of each setting, got none")
         if unknown := [s for s in self.systems if s not in get_args(System)]:
             raise ConfigError(f"sweep: systems: expected some of {', '.join(get_args(System))}, got {unknown[0]}")
-        budgets = self._budgets()
-        if twice := [name for name in names if any(budgets.values()) and name in BUDGET_FIELDS]:
+        budgets, usual = self._budgets()
+        if twice := [name for name in names if (budgets or usual) and name in BUDGET_FIELDS]:
             raise ConfigError(f"set: {twice[0]}: expected the budget once, got it as an option too; leave one out")
         runs = []
-        for seed, task_name, system, values in itertools.product(
-            self.seeds, self.tasks, self.systems, itertools.product(*columns)
+        for seed, task_name, named, values in itertools.product(
+            self.seeds, self.tasks, self.systems or (None,), itertools.product(*columns)
         ):
             overrides = tuple((name, _hashable(value)) for name, value in zip(names, values, strict=True))
             settings = dict(overrides)
             task = get_task(task_name, settings.get("env_kwargs", ()), settings.get("imports", ())).name
+            system = named or usual_system(task, self.preset, settings)
             variant = variant_name(system, overrides)
-            runs.append(RunSpec(task, system, seed, budgets[system] + overrides, self.preset, variant))
+            runs.append(RunSpec(task, system, seed, budgets.get(system, usual) + overrides, self.preset, variant))
+        systems = list(dict.fromkeys(run.system for run in runs))
+        if unknown := [s for s in self.budgets if s not in systems]:
+            raise ConfigError(f"budget: expected a system of the grid ({', '.join(systems)}), got {unknown[0]}")
         for run in runs:
             _ = run.config
         return list(dict.fromkeys(runs))
 
-    def _budgets(self) -> dict[str, tuple[tuple[str, Any], ...]]:
-        """System -> the settings of its runs' budget."""
+    def _budgets(self) -> tuple[dict[str, tuple[tuple[str, Any], ...]], tuple[tuple[str, Any], ...]]:
+        """System -> the settings of its runs' budget, and those of all others."""
         usual = tuple((n, v) for n in BUDGET_FIELDS if (v := getattr(self, n)) is not None)
         if len(usual) > 1:
             raise ConfigError("sweep: expected iterations or real_steps, got both; leave one out")
-        if unknown := [s for s in self.budgets if s not in self.systems]:
-            raise ConfigError(f"budget: expected a system of the grid ({', '.join(self.systems)}), got {unknown[0]}")
-        own = {system: (("real_steps", steps),) for system, steps in self.budgets.items()}
-        return {system: own.get(system, usual) for system in self.systems}
+        return {system: (("real_steps", steps),) for system, steps in self.budgets.items()}, usual
 
 
 def from_file(path: Path) -> Grid:

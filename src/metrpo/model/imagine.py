@@ -33,8 +33,9 @@ core alone reads more than it computes: the cores of a CPU then share the models
 (docs/performance.md, "Models shared by the cores")."""
 
 
-_Going = tuple[Float[Array, "N S"], Float[Array, "N"], Bool[Array, "N"], Float[Array, "N A"] | None]
-"""Of imagined episodes: states, 1 where they go on, which have diverged, and the last actions, where they matter."""
+_Going = tuple[Float[Array, "N S"], Float[Array, "N"], Bool[Array, "N"], Bool[Array, "N"], Float[Array, "N A"] | None]
+"""Of imagined episodes: states, 1 where they go on, which have diverged, for which the models are trusted, and the last
+actions, where they matter."""
 _Valued = tuple[Float[Array, "K N S"], Float[Array, "K N"], Float[Array, "K N"], Float[Array, "K N A"] | None]
 """Of episodes in each model: states, 1 where they go on, the return so far, and the last actions, where they matter."""
 
@@ -65,7 +66,7 @@ class Simulator:
     bounds: Bounds | None = None
     """What predictions are brought within; None: anything goes."""
     trusted: Float[Array, ""] | None = None
-    """Episodes are cut after a step in which the models disagree by more than this; None: never."""
+    """Episodes stand still from the first step on in which the models disagree by more than this; None: never."""
 
     def nothing_before(self, *rows: int) -> Array | None:
         """The actions before the first step, [*rows, A]; None where they do not matter."""
@@ -129,7 +130,7 @@ def imagine(
     episode_key = jax.random.fold_in(key, horizon)
 
     def step(carry: _Going, key: Key[Array, ""]) -> tuple[_Going, Trajectories]:
-        states, alive, diverged, before = carry
+        states, alive, diverged, trusted, before = carry
         action_key, model_key = jax.random.split(key)
         acted = act(states, action_key)
         actions, noted = acted if isinstance(acted, tuple) else (acted, None)
@@ -140,22 +141,29 @@ def imagine(
         following, rewards, ended = outcome(simulator.reward, simulator.terminated, states, clipped, predicted)
         if bonus:
             rewards = rewards + bonus * disagreement(models, states, clipped)
-        bad = ~_sound(following, rewards)
-        recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive, noted=noted)
+        if simulator.trusted is not None:
+            apart = disagreement(models, *jax.lax.stop_gradient((states, clipped)))
+            trusted = trusted & (apart <= simulator.trusted)
+        bad = ~_sound(following, rewards) & trusted
+        counts = jnp.float32(trusted)
+        recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive, noted=noted, trusted=counts)
         diverged = diverged | (bad & (alive > 0))
         if ended is not None:
-            alive = alive * (1.0 - ended)
-        if simulator.trusted is not None:
-            alive = alive * (disagreement(models, states, clipped) <= simulator.trusted)
+            alive = alive * (1.0 - ended * counts)
         # A diverged rollout stands still, so that it stays finite; it is masked below.
-        following = jnp.where(bad[:, None], states, following)
-        return (following, alive, diverged, None if before is None else clipped), recorded
+        following = jnp.where((bad | ~trusted)[:, None], states, following)
+        return (following, alive, diverged, trusted, None if before is None else clipped), recorded
 
-    carry = (starts, jnp.ones(rows), jnp.zeros(rows, bool), simulator.nothing_before(rows))
-    (last, alive, diverged, _), trajectories = jax.lax.scan(step, carry, jax.random.split(key, horizon))
+    carry = (starts, jnp.ones(rows), jnp.zeros(rows, bool), jnp.ones(rows, bool), simulator.nothing_before(rows))
+    (last, alive, diverged, _, _), trajectories = jax.lax.scan(step, carry, jax.random.split(key, horizon))
     mask = trajectories.mask * (1.0 - diverged)
     total, lost, rollouts, steps = across(
-        (jnp.sum(trajectories.rewards * mask), jnp.sum(diverged), jnp.float32(rows), jnp.sum(mask))
+        (
+            jnp.sum(jnp.where(mask * trajectories.trusted > 0, trajectories.rewards, 0.0)),
+            jnp.sum(diverged),
+            jnp.float32(rows),
+            jnp.sum(mask * trajectories.trusted),
+        )
     )
     info = ImagineInfo(total / jnp.maximum(rollouts - lost, 1), lost / rollouts, steps)
     return trajectories._replace(mask=mask, last=last, going_on=alive * (1.0 - diverged)), info

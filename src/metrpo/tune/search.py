@@ -16,7 +16,7 @@ from metrpo.config import Config, Preset, System, flatten
 from metrpo.errors import ConfigError
 from metrpo.launch.grid import flat, seeds_of
 from metrpo.launch.run_spec import RunSpec
-from metrpo.presets import configured, override
+from metrpo.presets import configured, override, usual_system
 from metrpo.run.metrics import Row, numbers
 from metrpo.tune.space import Span, span
 from metrpo.world.registry import get_task
@@ -44,7 +44,8 @@ class Search:
     task: str
     space: Mapping[str, Span]
     """Dotted setting -> its range or choices."""
-    system: System = "me-trpo"
+    system: System | None = None
+    """None: the task's usual one."""
     preset: Preset = "fast"
     seeds: tuple[int, ...] = (0, 1)
     """Seeds of every trial, whose value is their mean."""
@@ -81,6 +82,7 @@ class Search:
                 "searched one; add --pruner none, and --real-steps, so that all trials cost the same"
             )
         object.__setattr__(self, "task", self._task().name)
+        object.__setattr__(self, "system", self.system or usual_system(self.task, self.preset, self.settings))
         for name, over in self.space.items():
             for value in over.outermost:
                 override(self.base, {name: value})

@@ -81,17 +81,18 @@ def real_steps(count=5, ends=0.0):
 
 
 def rollouts_of(seed=0, steps=4, count=7):
-    """Episodes that go on, end at some step (the last one included), or have diverged."""
+    """Episodes that go on, stand still after two steps, end at some step (the last one included), or have diverged."""
     rng = np.random.default_rng(seed)
     lives = np.array([9, 9, 1, 2, 3, 4, 0])[:count]  # steps that count; 9: goes on
     mask = (np.arange(steps)[:, None] < lives).astype(np.float32)
+    moves = (np.arange(steps)[:, None] < np.array([9, 2, 9, 9, 9, 9, 9])[:count]).astype(np.float32)
 
     def draw(*shape):
         return rng.normal(size=shape).astype(np.float32)
 
     shape = steps, count
     return Trajectories(
-        draw(*shape, 2), draw(*shape, 2), draw(*shape), mask, draw(count, 2), (lives == 9) * 1.0, draw(*shape)
+        draw(*shape, 2), draw(*shape, 2), draw(*shape), mask, draw(count, 2), (lives == 9) * 1.0, draw(*shape), moves
     )
 
 
@@ -107,6 +108,8 @@ def slow_return(r, start, n, weight, discount, after):
         if not goes_on:
             return total
         factor *= discount
+        if t + 1 < steps and not r.trusted[t + 1, n]:
+            break
         if t + 1 < steps:
             total -= factor * weight * r.noted[t + 1, n]
     return total + factor * after[n]
@@ -114,22 +117,31 @@ def slow_return(r, start, n, weight, discount, after):
 
 def test_soft_returns_are_those_of_a_slow_version():
     r, after = rollouts_of(), np.arange(7, dtype=np.float32) + 3
-    got = on_host()(lambda r, after: soft_returns(r, 0.3, 0.9, after))(r, after)
-    expected = [[slow_return(r, t, n, 0.3, 0.9, after) for n in range(7)] for t in range(4)]
-    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
+    got, first = on_host()(lambda r, after: soft_returns(r, 0.3, 0.9, after))(r, after)
+    expected = np.array([[slow_return(r, t, n, 0.3, 0.9, after) for n in range(7)] for t in range(4)])
+    counts = r.trusted > 0
+    np.testing.assert_allclose(got[counts], expected[counts], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(first, expected[0] - 0.3 * r.noted[0], rtol=1e-5, atol=1e-6)
+
+
+def test_an_episode_that_never_moves_is_worth_the_state_that_it_stands_in():
+    r, after = rollouts_of()._replace(trusted=np.zeros((4, 7), np.float32)), np.arange(7, dtype=np.float32)
+    np.testing.assert_array_equal(soft_returns(r, 0.3, 0.9, after)[1], after)
 
 
 def test_targets_are_valued_by_the_least_of_the_target_critics():
     r, one = rollouts_of(1), learner()
     last = (r.last, np.zeros_like(r.last), np.full(7, 0.4, np.float32))
     lessons = expanded(SETTINGS, one, r, last)
-    for got, given in zip((lessons.states, lessons.actions, lessons.mask), (r.states, r.actions, r.mask), strict=True):
+    for got, given in zip(
+        (lessons.states, lessons.actions, lessons.mask), (r.states, r.actions, r.mask * r.trusted), strict=True
+    ):
         np.testing.assert_array_equal(got, given[:3].reshape(21, *given.shape[2:]))
-    got = np.asarray(lessons.targets).reshape(3, 7)
+    got, counts = np.asarray(lessons.targets).reshape(3, 7), r.trusted[:3] > 0
     said = np.asarray(valued(WIDE, networks.outputs(one.targets, *last[:2]))).min(axis=0)
     weight = math.exp(float(one.log_entropy_weight))
     expected = [[slow_return(r, t, n, weight, 0.9, said - weight * 0.4) for n in range(7)] for t in range(3)]
-    np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(got[counts], np.array(expected)[counts], rtol=1e-4, atol=1e-5)
 
 
 def test_what_no_return_can_be_is_no_target():

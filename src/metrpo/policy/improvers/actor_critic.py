@@ -151,8 +151,8 @@ def actor_gradient(
         said = critic_networks.outputs(learner.critics, rollouts.last, actions)
         after = valued(learner.scale, jnp.mean(said, axis=0) if a.terminal == "mean" else jnp.min(said, axis=0))
         if a.horizon:
-            returns = soft_returns(rollouts, weight, settings.discount, after - weight * log_probs)
-            first, mask = returns[0] - weight * rollouts.noted[0], rollouts.mask[0]
+            _, first = soft_returns(rollouts, weight, settings.discount, after - weight * log_probs)
+            mask = rollouts.mask[0]
         else:
             first, mask = after - weight * log_probs, rollouts.going_on
         # Diverged episodes have a mask of 0, but what they met may be no number.
@@ -164,21 +164,23 @@ def actor_gradient(
     return jax.tree.map(lambda g: g / count, across(gradient)), jax.lax.stop_gradient(happened)
 
 
-def soft_returns(rollouts: Trajectories, weight: Array, discount: float, after: Array) -> Array:
-    """[T, N]: rewards from each step on, with the entropy of the actions after it, and `after` [N] the last state.
+def soft_returns(rollouts: Trajectories, weight: Array, discount: float, after: Array) -> tuple[Array, Array]:
+    """[T, N]: rewards from each step on, the entropy of actions after it, and `after` [N], the value of the last state.
 
-    The entropy of a step's own action is left out, as in Q(s, a).
+    The entropy of a step's own action is left out, as in Q(s, a). The second result, [N], is of the first states, with
+    it. An episode that stands still has the value of the state that it stands in.
     """
 
-    def back(following: Array, step: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
-        reward, log_prob, mask, goes_on = step
+    def back(following: Array, step: tuple[Array, Array, Array, Array, Array]) -> tuple[Array, Array]:
+        reward, log_prob, mask, goes_on, moves = step
         value = mask * (reward + discount * goes_on * following)
-        return value - weight * log_prob, value
+        return jnp.where(moves > 0, value - weight * log_prob, following), value
 
     # An episode that ends at a step has a mask of 0 from the next one on.
     goes_on = jnp.concatenate([rollouts.mask[1:], rollouts.going_on[None]])
-    steps = (rollouts.rewards, rollouts.noted, rollouts.mask, goes_on)
-    return jax.lax.scan(back, after, steps, reverse=True)[1]
+    steps = (rollouts.rewards, rollouts.noted, rollouts.mask, goes_on, rollouts.trusted)
+    first, values = jax.lax.scan(back, after, steps, reverse=True)
+    return values, first
 
 
 class Lessons(NamedTuple):
@@ -197,8 +199,9 @@ class Lessons(NamedTuple):
 def expanded(settings: UpdateSettings, learner: Learner, rollouts: Trajectories, last: Last) -> Lessons:
     """Of the first states of imagined episodes: all that follows there, then the target critics (value expansion)."""
     weight, scale, steps = jnp.exp(learner.log_entropy_weight), learner.scale, settings.actor_critic.critic_steps
-    returns = soft_returns(rollouts, weight, settings.discount, _after(learner, *last))
-    lessons = Lessons(rollouts.states, rollouts.actions, jnp.clip(returns, scale.lowest, scale.highest), rollouts.mask)
+    returns, _ = soft_returns(rollouts, weight, settings.discount, _after(learner, *last))
+    targets, mask = jnp.clip(returns, scale.lowest, scale.highest), rollouts.mask * rollouts.trusted
+    lessons = Lessons(rollouts.states, rollouts.actions, targets, mask)
     return jax.tree.map(lambda x: x[:steps].reshape(-1, *x.shape[2:]), lessons)
 
 
