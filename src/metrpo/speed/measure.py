@@ -22,7 +22,7 @@ from metrpo import training
 from metrpo.launch.status import Tell
 from metrpo.run.directory import RunDirectory
 from metrpo.run.machine import cores, device_names
-from metrpo.speed import ours, peers
+from metrpo.speed import ours, peers, until_imagined
 
 TURN = 1.0
 """Seconds for which one piece of work is repeated in a round; what takes longer is done once."""
@@ -251,33 +251,14 @@ def compilations() -> Iterator[list[float]]:
         jax.monitoring.unregister_event_duration_listener(listen)
 
 
-_START = """
-import sys
-from metrpo import cli, options
-parse = options.parse
-def with_a_bell(arguments):
-    command = parse(arguments)  # sets JAX's environment
-    import jax
-    from metrpo import phase
-    updates = phase._updates
-    def imagined(*given):
-        jax.block_until_ready(updates(*given))
-        print("imagined", flush=True)
-        sys.exit(0)
-    phase._updates = imagined
-    return command
-cli.parse = with_a_bell
-cli.main(["train", sys.argv[1], "--run-dir", sys.argv[2]])
-"""
-
-
 def _start_to_imagined() -> float | None:
     """Seconds of a second process: the first one fills the compile cache. They hold collecting and the first fit."""
     seconds = None
     for _ in range(2):
         with tempfile.TemporaryDirectory() as scratch:
             start = time.perf_counter()
-            command = [sys.executable, "-c", _START, ours.TASK, str(Path(scratch) / "run")]
+            arguments = [ours.TASK, "--run-dir", str(Path(scratch) / "run")]
+            command = [sys.executable, "-m", until_imagined.__name__, *arguments]
             done = subprocess.run(command, capture_output=True, text=True)
-            seconds = time.perf_counter() - start if "imagined" in done.stdout else None
+            seconds = time.perf_counter() - start if until_imagined.SAID in done.stdout else None
     return seconds

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from metrpo import devices, policy_phase
+from metrpo.actor_critic_phase import branches, run_block
 from metrpo.config import AdvantageConfig, CollectConfig, Config, FitConfig, TRPOConfig
 from metrpo.devices import FIRST, SECOND, WHOLE
 from metrpo.model import ensemble as ensembles
@@ -24,9 +25,11 @@ from metrpo.model.fit import fit
 from metrpo.model.imagine import Simulator, imagine
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
-from metrpo.policy.improvers import trpo
+from metrpo.policy.improvers import actor_critic, trpo
+from metrpo.policy.improvers.actor_critic import Steps, UpdateSettings
 from metrpo.policy.improvers.batch import Batch
 from metrpo.policy.value import linear
+from metrpo.policy.value.critics import Scale
 from metrpo.presets import override, preset
 from metrpo.types import Array, Trajectories, Transitions
 from metrpo.world import collection as real
@@ -36,7 +39,12 @@ from metrpo.world.task import Task
 TASK = "HalfCheetah"
 STATE, ACTION, MEMBERS, BATCH = 18, 6, 5, 1000
 ROLLOUTS, HORIZON = 500, 100
-HIDDEN = {"1024": (1024, 1024), "200x4": (200, 200, 200, 200), "200x2": (200, 200)}
+HIDDEN = {
+    "1024": (1024, 1024),
+    "200x4": (200, 200, 200, 200),
+    "200x3": (200, 200, 200),
+    "200x2": (200, 200),
+}
 FIT_STEPS = 5
 """Minibatches of a pass over the training set; the peers average over as many steps, without a validation."""
 PRODUCTS = 20
@@ -71,6 +79,7 @@ def works() -> dict[str, Callable[[], Work]]:
         "trpo": lambda: _trpo(TRPOConfig()),
         "trpo-1-cg": lambda: _trpo(TRPOConfig(cg_iterations=1)),
         "trpo-no-search": lambda: _trpo(TRPOConfig(cg_iterations=1, max_backtracks=1)),
+        "actor-critic": _actor_critic,
         "baseline": _baseline,
         "validate-1024": lambda: _validate("1024"),
         "validate-200x2": lambda: _validate("200x2"),
@@ -205,6 +214,28 @@ def _trpo(config: TRPOConfig) -> Work:
     run = jax.jit(devices.spread(update, mesh, (WHOLE, FIRST), WHOLE))
     policy, batch = devices.copied(policy, mesh), devices.shared(batch, mesh)
     return Work(_timed(lambda: run(policy, batch)), units=count)
+
+
+def _actor_critic() -> Work:
+    """An update of actor, critics and entropy weight, in a block of as many as a run has; the states are given."""
+    config = preset(TASK, "fast", "actor-critic")
+    settings, task, a = UpdateSettings.of(config), _task(), config.actor_critic
+    learner = actor_critic.init(settings, jax.random.key(2), STATE, ACTION, config.policy.hidden)
+    learner = learner._replace(scale=Scale(*map(jnp.float32, (0.0, 1.0, -100.0, 100.0))))
+    models = _ensemble("200x3")
+    simulator = Simulator(models, task.reward, task.terminated, a.horizon, trusted=jnp.float32(1e6))
+    states, actions, deltas, _ = _data(a.block * a.real_batch)
+    shape = a.block, a.real_batch
+    real = Steps(
+        states.reshape(*shape, STATE),
+        actions.reshape(*shape, ACTION),
+        actions[:, 0].reshape(shape),
+        (states + deltas).reshape(*shape, STATE),
+        np.ones(shape, np.float32),
+    )
+    keys, starts = jax.random.split(jax.random.key(3), a.block), _starts(branches(settings, a.block))
+    run = _timed(lambda: run_block(settings, simulator, learner, starts, real, keys))
+    return Work(lambda: run() / a.block, units=a.batch_size + a.real_batch)
 
 
 def _baseline() -> Work:

@@ -10,7 +10,7 @@ import torch
 STATE, ACTION = 18, 6
 MEMBERS, BATCH = 5, 1000
 ROLLOUTS, HORIZON = 500, 100
-HIDDEN = {"1024": (1024, 1024), "200x4": (200, 200, 200, 200)}
+HIDDEN = {"1024": (1024, 1024), "200x4": (200, 200, 200, 200), "200x3": (200, 200, 200)}
 FIT_STEPS = 5
 """Training steps that one repetition averages over."""
 LEARNING_RATE = 1e-3

@@ -156,7 +156,101 @@ def conjugate_gradient(product: Callable[[Any], Any], target: Any) -> tuple[Any,
     return x, residual
 
 
+CRITICS, STARTS, STEPS, DISCOUNT, WEIGHT, TARGET_RATE = 2, 256, 3, 0.99, 0.1, 0.005
+
+
+class Critic(torch.nn.Module):
+    """Values states and actions: layers of 256 and 256, normalised."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        layers: list[Any] = []
+        for size in (STATE + ACTION, 256):
+            layers += [torch.nn.Linear(size, 256), torch.nn.LayerNorm(256, elementwise_affine=False), torch.nn.SiLU()]
+        self.layers = torch.nn.Sequential(*layers, torch.nn.Linear(256, 1))
+
+    def forward(self, states: Any, actions: Any) -> Any:
+        """[..., S], [..., A] -> [...]."""
+        return self.layers(torch.cat([states, actions], dim=-1))[..., 0]
+
+
+def actor_critic() -> Repetition:
+    """An update of actor, critics and entropy weight on short rollouts, and on as many real transitions."""
+    torch.manual_seed(3)
+    layers, critics = networks("200x3"), [Critic() for _ in range(CRITICS)]
+    targets = [Critic() for _ in range(CRITICS)]
+    actor = torch.nn.Sequential(
+        *(torch.nn.Linear(STATE, 256), torch.nn.Tanh(), torch.nn.Linear(256, 256), torch.nn.Tanh()),
+        torch.nn.Linear(256, 2 * ACTION),
+    )
+    log_weight = torch.tensor(WEIGHT).log().requires_grad_()
+    of_critics = [x for critic in critics for x in critic.parameters()]
+    groups = (list(actor.parameters()), of_critics, [log_weight])
+    optimizers = [torch.optim.Adam(group, lr=3e-4, fused=True) for group in groups]
+    real = [torch.randn(STARTS, size) for size in (STATE, ACTION, STATE)]
+    real_rewards, first = torch.randn(STARTS), 0.1 * torch.randn(STARTS, STATE)
+    frozen = [(weights.detach(), biases.detach()) for weights, biases in layers]
+
+    def sample(states: Any) -> tuple[Any, Any]:
+        means, log_std = actor(states).chunk(2, dim=-1)
+        log_std = log_std.clamp(-5.0, 2.0)
+        noise = torch.randn_like(means)
+        drawn = means + log_std.exp() * noise
+        slope = 2.0 * (0.6931 - drawn - torch.nn.functional.softplus(-2.0 * drawn))
+        return drawn.tanh(), (-0.5 * noise.square() - log_std - 0.9189 - slope).sum(dim=-1)
+
+    def spread(states: Any, actions: Any) -> Any:
+        """How far the members' predictions lie apart."""
+        with torch.no_grad():
+            inputs = torch.cat([states, actions], dim=1).expand(MEMBERS, -1, -1)
+            return predict(frozen, inputs).std(dim=0).mean(dim=1)
+
+    def step() -> None:
+        weight, states, rewards, entropies, trusted = log_weight.exp().detach(), first, [], [], []
+        kept = None
+        for _ in range(STEPS):
+            actions, log_probability = sample(states)
+            kept = kept or (states, actions.detach())
+            order = torch.randperm(STARTS)[: STARTS // MEMBERS * MEMBERS]
+            inputs = torch.cat([states, actions], dim=1)[order].view(MEMBERS, -1, STATE + ACTION)
+            following = states.index_add(0, order, predict(frozen, inputs).view(-1, STATE))
+            trusted.append(spread(states, actions))
+            rewards.append(reward(actions, following)[:, 0])
+            entropies.append(log_probability)
+            states = following
+        actions, log_probability = sample(states)
+        value = torch.stack([critic(states, actions) for critic in critics]).mean(dim=0) - weight * log_probability
+        with torch.no_grad():
+            least = torch.stack([target(states, actions) for target in targets]).amin(dim=0)
+            aim = least - weight * log_probability
+        for i in reversed(range(STEPS)):
+            value = rewards[i] + DISCOUNT * value - weight * entropies[i]
+            aim = rewards[i].detach() + DISCOUNT * (aim if i == STEPS - 1 else aim - weight * entropies[i + 1].detach())
+        optimizers[0].zero_grad()
+        (-value.mean()).backward()
+        with torch.no_grad():
+            next_actions, next_log = sample(real[2])
+            after = torch.stack([target(real[2], next_actions) for target in targets]).amin(dim=0) - weight * next_log
+            aims = torch.cat([aim.detach(), real_rewards + DISCOUNT * after])
+        assert kept is not None
+        seen, done = torch.cat([kept[0], real[0]]), torch.cat([kept[1], real[1]])
+        optimizers[1].zero_grad()
+        sum((critic(seen, done) - aims).square().mean() for critic in critics).backward()  # type: ignore[union-attr]
+        optimizers[2].zero_grad()
+        (log_weight * (-entropies[0].detach().mean() + ACTION)).backward()
+        torch.nn.utils.clip_grad_norm_(groups[0], 10.0)
+        for optimizer in optimizers:
+            optimizer.step()
+        with torch.no_grad():
+            for critic, target in zip(critics, targets, strict=True):
+                for new, slow in zip(critic.parameters(), target.parameters(), strict=True):
+                    slow.lerp_(new, TARGET_RATE)
+
+    return lambda: timed(step, FIT_STEPS)
+
+
 WORK = {
+    "actor-critic": actor_critic,
     "fit-1024": partial(fit, "1024"),
     "fit-200x4": partial(fit, "200x4"),
     "fit-1024-bfloat16": partial(fit, "1024", bfloat16=True),

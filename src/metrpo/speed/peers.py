@@ -35,6 +35,7 @@ WORK = {
     "mbrl-lib": ("fit-1024", "fit-200x4", "fit-1024-basic", "imagine-1024", "imagine-200x4"),
     "sb3-contrib": ("trpo", "trpo-value"),
     "pytorch": (
+        "actor-critic",
         "fit-1024",
         "fit-200x4",
         "fit-1024-bfloat16",
