@@ -299,7 +299,7 @@ class ActorCriticConfig:
     """States from which an update imagines."""
     real_batch: int = 256
     """Real transitions from which the critics learn in every update, besides imagined ones."""
-    horizon: int = 5
+    horizon: int = 3
     """Steps that an update imagines: for the critics' targets, and for the actor's gradient through the models. 0:
     none, the critics learn from real transitions alone (soft actor-critic)."""
     branch_steps: int = 20
