@@ -63,10 +63,11 @@ def phases(config: Config, state: State, count: int, fresh: bool, variant: str, 
     first = init(config).policy if fresh else state.policy
     baseline = init_baseline(config.advantage, task.state_size, key_of(seed, 0, Stage.IMPROVE))
     state = state._replace(policy=first, baseline=baseline)
-    earned = np.nan
+    # A policy that goes on keeps its standard deviation; only an untrained one begins with the initial one.
+    earned, before = np.nan, 0 if fresh else state.iteration
     for number in range(1, count + 1):
         policy, baseline, info = policy_search.improve_policy(
-            config, task, state._replace(iteration=number - 1), ensemble, SILENT, Clock()
+            config, task, state._replace(iteration=before + number - 1), ensemble, SILENT, Clock()
         )
         state = state._replace(policy=policy, baseline=baseline)
         earned = float(np.mean(records.evaluate(config, task, policy, number, origin=state.origin)))
