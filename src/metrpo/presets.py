@@ -57,8 +57,13 @@ FAST_ALL: Overrides = {
 }
 
 FAST: dict[str, Overrides] = {
-    # Short of real steps: iterations of half the size, and half the proof.
-    "Swimmer": {"iterations": 20, "collect.steps": 1500, "validate.real_episodes": 2},
+    # Short of real steps: iterations of half the size, half the proof, and noise that lasts as long as a stroke.
+    "Swimmer": {
+        "iterations": 20,
+        "collect.noise_correlation": 0.9,
+        "collect.steps": 1500,
+        "validate.real_episodes": 2,
+    },
     "Snake": {"iterations": 20},
     "Hopper": {"iterations": 20},
     "HalfCheetah": {"iterations": 20},
