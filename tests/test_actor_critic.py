@@ -202,7 +202,9 @@ def test_it_finds_the_optimum_of_a_linear_system():
         preset("Probe", "fast", "actor-critic"),
         {
             "actor_critic.critic_hidden": (32, 32),
+            "actor_critic.critic_learning_rate": 1e-3,
             "actor_critic.random_steps": 100,
+            "actor_critic.target_rate": 0.02,
             "actor_critic.updates_per_step": 5.0,
             "advantage.discount": 0.95,
             "collect.max_train": 1000,
@@ -211,13 +213,14 @@ def test_it_finds_the_optimum_of_a_linear_system():
             "collect.steps": 100,
             "ensemble.hidden": (16,),
             "ensemble.members": 3,
+            "gradient.learning_rate": 1e-3,
             "iterations": 4,
             "policy.hidden": (16,),
             "trust_reward": True,
         },
     )
     state = training.train(config)
-    assert probe.real_return(state.policy) > 1.25 * probe.optimum()
+    assert probe.real_return(state.policy) > 1.1 * probe.optimum()
 
 
 def test_the_system_is_the_actor_critic():
