@@ -82,7 +82,9 @@ def test_a_new_sampling_and_a_new_improver_are_a_row_and_a_name_each(tmp_path):
         (package / name).write_text((package / name).read_text() + text)
     schema = package / "config" / "schema.py"
     choices = schema.read_text().replace('"one_model"] = "step_rand"', '"one_model", "boldest_model"] = "step_rand"')
-    schema.write_text(choices.replace('"bptt-stochastic", "actor-critic"]', '"bptt-stochastic", "bold", "actor-critic"]'))
+    schema.write_text(
+        choices.replace('"bptt-stochastic", "actor-critic"]', '"bptt-stochastic", "bold", "actor-critic"]')
+    )
     chosen = ["--iterations", "1", "--imagine.sampling", "boldest_model", "--improver", "bold"]
     line = tiny_run.process_line(tmp_path / "run", *chosen)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (tmp_path, SUPPORT)))}

@@ -173,6 +173,7 @@ BRIEF = probe.BRIEF | {
     "fit.batch_size": 50,
 }
 BRIEF |= {"fit.learning_rate": 0.02, "fit.patience": 300}
+BRIEF |= {"collect.noise_correlation": 0.0}  # noise that lasts tells the blind what they did not see
 
 
 def config(task="Late", **settings):

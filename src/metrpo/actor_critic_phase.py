@@ -97,8 +97,10 @@ def reached(simulator: Simulator, learner: Learner, starts: Array, key: Array) -
         return squashed.sample(learner.actor, seen, key)[0]
 
     rollouts, _ = imagine(simulator, act, starts, key)
-    moved = jnp.concatenate([jnp.ones_like(rollouts.trusted[:1]), rollouts.trusted[:-1]])
-    return Pool(rollouts.states.reshape(-1, starts.shape[-1]), (rollouts.mask * moved).reshape(-1))
+    mask = rollouts.mask
+    if rollouts.trusted is not None:  # the state in which an episode comes to stand counts once
+        mask = mask.at[1:].multiply(rollouts.trusted[:-1])
+    return Pool(rollouts.states.reshape(-1, starts.shape[-1]), mask.reshape(-1))
 
 
 def drawn(pool: Pool, count: int, key: Array) -> Array:

@@ -71,7 +71,8 @@ class Trajectories(NamedTuple):
     noted: Any = None
     """[T, N, ...], a pytree: what the policy said besides its actions."""
     trusted: Float[Array, "T N"] = None
-    """0 from the first step on with which the models are not trusted: from there on the episode stands still."""
+    """0 from the first step on with which the models are not trusted, and the episode stands still. None: they always
+    are trusted."""
 
 
 RewardFormula = Callable[[Array, Array, Array], Array]

@@ -210,7 +210,7 @@ def test_exploding_rollouts_are_masked_whole_and_counted():
     assert info.diverged == pytest.approx(3 / 5)
     assert info.steps == 20
     assert info.mean_return == pytest.approx(1e-5 * 11_111_111_110 / 2, rel=1e-4)
-    assert all(np.all(np.isfinite(x)) for x in t)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(t))
     # Until they diverge they are followed, then they stand still.
     np.testing.assert_allclose(t.states[:, 2, 0], [*(10.0 ** np.arange(6)), *[1e5] * 4], rtol=1e-5)
 
@@ -225,13 +225,13 @@ def test_a_reward_that_is_no_number_masks_its_rollout():
     np.testing.assert_array_equal(t.mask, np.broadcast_to([1, 0, 0], (10, 3)))
     assert info.diverged == pytest.approx(2 / 3)
     assert (info.steps, info.mean_return) == (10, 10)
-    assert all(np.all(np.isfinite(x)) for x in t)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(t))
 
 
 def test_only_rollouts_that_meet_a_model_of_nan_are_masked():
     """One of two models is broken: a rollout of 2 steps survives with probability 1/4."""
     t, info = imagined_without_policy(growing([1.0, np.nan]), np.ones((400, 1), np.float32), KEY, plain, horizon=2)
-    assert all(np.all(np.isfinite(x)) for x in t)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(t))
     alive = np.asarray(t.mask[0])
     np.testing.assert_array_equal(t.mask[1], alive)
     assert float(info.diverged) == pytest.approx(1 - alive.mean())
@@ -243,7 +243,7 @@ def test_when_all_rollouts_diverge_the_numbers_stay_finite():
     t, info = imagined_without_policy(growing([np.nan]), np.ones((4, 1), np.float32), KEY, plain)
     assert not np.any(t.mask)
     assert (info.mean_return, info.diverged, info.steps) == (0, 1, 0)
-    assert all(np.all(np.isfinite(x)) for x in t)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(t))
 
 
 def test_a_rollout_that_ends_before_it_explodes_counts():
@@ -255,7 +255,7 @@ def test_a_rollout_that_ends_before_it_explodes_counts():
     assert info.diverged == 0
     assert info.steps == 13
     assert info.mean_return == pytest.approx((110 + 1e-9 * 11_111_111_110 + 200) / 3, rel=1e-4)
-    assert all(np.all(np.isfinite(x)) for x in t)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(t))
 
 
 # ---------------------------------------------------------------- the choice of the model

@@ -59,9 +59,13 @@ def runs(system, seeds, task="Swimmer", iterations=3):
 # ---------------------------------------------------------------- the tables
 
 
+OURS = {"actor-critic"}
+"""Systems that the paper does not have."""
+
+
 def test_every_system_is_in_a_figure_and_every_figure_has_some():
     named = {system for figure in FIGURES.values() for system in figure.systems.values()}
-    assert named == set(SYSTEMS)
+    assert named == set(SYSTEMS) - OURS
     for figure in FIGURES.values():
         assert set(figure.tasks) <= set(tasks())
         assert len(set(figure.systems.values())) == len(figure.systems)
@@ -75,7 +79,7 @@ def test_every_system_is_in_a_figure_and_every_figure_has_some():
 
 def test_smoke_runs_every_system_once():
     found = runs_of("all", "smoke")
-    assert sorted(r.system for r in found) == sorted(SYSTEMS)
+    assert sorted(r.system for r in found) == sorted(set(SYSTEMS) - OURS)
 
 
 def test_the_paper_scale_is_the_papers_settings():

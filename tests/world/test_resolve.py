@@ -370,7 +370,7 @@ def test_the_first_state_has_outputs_for_what_is_learned():
 def test_the_generic_preset_follows_the_horizon():
     config = preset("Pendulum-v1")
     assert (config.iterations, config.collect.steps, config.validate.starts) == (10, 1000, 50)
-    config = preset("InvertedPendulum-v5", seed=3)
+    config = preset("InvertedPendulum-v5", "fast", "me-trpo", seed=3)
     assert (config.collect.steps, config.validate.starts, config.seed) == (5000, 10, 3)
     assert config.ensemble == preset("Swimmer").ensemble
     assert preset("InvertedPendulum-v5", "paper").ensemble == preset("Swimmer", "paper").ensemble

@@ -145,11 +145,12 @@ def imagine(
             apart = disagreement(models, *jax.lax.stop_gradient((states, clipped)))
             trusted = trusted & (apart <= simulator.trusted)
         bad = ~_sound(following, rewards) & trusted
-        counts = jnp.float32(trusted)
-        recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive, noted=noted, trusted=counts)
+        recorded = Trajectories(states, actions, jnp.where(bad, 0.0, rewards), alive, noted=noted)
+        if simulator.trusted is not None:
+            recorded = recorded._replace(trusted=jnp.float32(trusted))
         diverged = diverged | (bad & (alive > 0))
         if ended is not None:
-            alive = alive * (1.0 - ended * counts)
+            alive = alive * (1.0 - ended * trusted)
         # A diverged rollout stands still, so that it stays finite; it is masked below.
         following = jnp.where((bad | ~trusted)[:, None], states, following)
         return (following, alive, diverged, trusted, None if before is None else clipped), recorded
@@ -157,13 +158,9 @@ def imagine(
     carry = (starts, jnp.ones(rows), jnp.zeros(rows, bool), jnp.ones(rows, bool), simulator.nothing_before(rows))
     (last, alive, diverged, _, _), trajectories = jax.lax.scan(step, carry, jax.random.split(key, horizon))
     mask = trajectories.mask * (1.0 - diverged)
+    counts = mask if trajectories.trusted is None else mask * trajectories.trusted
     total, lost, rollouts, steps = across(
-        (
-            jnp.sum(jnp.where(mask * trajectories.trusted > 0, trajectories.rewards, 0.0)),
-            jnp.sum(diverged),
-            jnp.float32(rows),
-            jnp.sum(mask * trajectories.trusted),
-        )
+        (jnp.sum(trajectories.rewards * counts), jnp.sum(diverged), jnp.float32(rows), jnp.sum(counts))
     )
     info = ImagineInfo(total / jnp.maximum(rollouts - lost, 1), lost / rollouts, steps)
     return trajectories._replace(mask=mask, last=last, going_on=alive * (1.0 - diverged)), info

@@ -190,7 +190,7 @@ def _imagine(width: str, products: str) -> Work:
     def rollouts(simulator: Simulator, policy: Policy, starts: Array, key: Array) -> Any:
         return imagine(simulator, partial(gaussian.sample, policy), starts, key)
 
-    imagined = Trajectories(SECOND, SECOND, SECOND, SECOND, last=FIRST, going_on=FIRST, trusted=SECOND)
+    imagined = Trajectories(SECOND, SECOND, SECOND, SECOND, last=FIRST, going_on=FIRST)
     run = jax.jit(devices.spread(rollouts, mesh, (WHOLE, WHOLE, FIRST, WHOLE), (imagined, WHOLE)))
     given = (*devices.copied((simulator, policy), mesh), _starts(ROLLOUTS), jax.random.key(0))
     steps = ROLLOUTS * HORIZON

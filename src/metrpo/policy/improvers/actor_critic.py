@@ -178,7 +178,7 @@ def soft_returns(rollouts: Trajectories, weight: Array, discount: float, after: 
 
     # An episode that ends at a step has a mask of 0 from the next one on.
     goes_on = jnp.concatenate([rollouts.mask[1:], rollouts.going_on[None]])
-    steps = (rollouts.rewards, rollouts.noted, rollouts.mask, goes_on, rollouts.trusted)
+    steps = (rollouts.rewards, rollouts.noted, rollouts.mask, goes_on, _moves(rollouts))
     first, values = jax.lax.scan(back, after, steps, reverse=True)
     return values, first
 
@@ -196,11 +196,15 @@ class Lessons(NamedTuple):
     """[L], 1 where a lesson is one."""
 
 
+def _moves(rollouts: Trajectories) -> Array:
+    return jnp.ones_like(rollouts.mask) if rollouts.trusted is None else rollouts.trusted
+
+
 def expanded(settings: UpdateSettings, learner: Learner, rollouts: Trajectories, last: Last) -> Lessons:
     """Of the first states of imagined episodes: all that follows there, then the target critics (value expansion)."""
     weight, scale, steps = jnp.exp(learner.log_entropy_weight), learner.scale, settings.actor_critic.critic_steps
     returns, _ = soft_returns(rollouts, weight, settings.discount, _after(learner, *last))
-    targets, mask = jnp.clip(returns, scale.lowest, scale.highest), rollouts.mask * rollouts.trusted
+    targets, mask = jnp.clip(returns, scale.lowest, scale.highest), rollouts.mask * _moves(rollouts)
     lessons = Lessons(rollouts.states, rollouts.actions, targets, mask)
     return jax.tree.map(lambda x: x[:steps].reshape(-1, *x.shape[2:]), lessons)
 
