@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import typing
+from collections.abc import Mapping
 from typing import Any, cast
 
-from metrpo.config import Config, Preset, convert
+from metrpo.config import Config, Preset, System, convert
 from metrpo.errors import ConfigError
 from metrpo.systems import PAPER as SYSTEMS_PAPER
 from metrpo.systems import SYSTEMS, Overrides
@@ -109,7 +110,7 @@ ONLY_ME_TRPO = frozenset({"improver", "method", "max_action", "max_change"})
 """Settings that the actor-critic cannot have."""
 
 
-def usual_system(task: str, name: str, settings: Overrides) -> str:
+def usual_system(task: str, name: str, settings: Mapping[str, Any]) -> System:
     """The system that a task has where none is asked for: `me-trpo`, under `fast` `actor-critic` for long episodes.
 
     Where `settings` say how to learn, or limit the actions (`ONLY_ME_TRPO`), it is `me-trpo`.
@@ -143,7 +144,7 @@ def preset(task: str, name: str = "fast", system: str | None = None, **top_level
     return override(config, overrides | {"system": system} | top_level)
 
 
-def _chosen(settings: Overrides) -> Overrides:
+def _chosen(settings: Mapping[str, Any]) -> Overrides:
     """Those of the settings that a task may need to be found, or to have its horizon."""
     return {name: settings[name] for name in ("env_kwargs", "imports") if name in settings}
 

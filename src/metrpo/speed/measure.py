@@ -22,8 +22,10 @@ from metrpo import training
 from metrpo.launch.status import Tell
 from metrpo.run.directory import RunDirectory
 from metrpo.run.machine import cores, device_names
-from metrpo.speed import ours, peers, until_imagined
+from metrpo.speed import ours, peers
 
+UNTIL_IMAGINED = sys.executable, "-m", "metrpo.commands.until_imagined"
+"""The command of a process that ends with its first imagined steps."""
 TURN = 1.0
 """Seconds for which one piece of work is repeated in a round; what takes longer is done once."""
 
@@ -258,7 +260,6 @@ def _start_to_imagined() -> float | None:
         with tempfile.TemporaryDirectory() as scratch:
             start = time.perf_counter()
             arguments = [ours.TASK, "--run-dir", str(Path(scratch) / "run")]
-            command = [sys.executable, "-m", until_imagined.__name__, *arguments]
-            done = subprocess.run(command, capture_output=True, text=True)
-            seconds = time.perf_counter() - start if until_imagined.SAID in done.stdout else None
+            done = subprocess.run([*UNTIL_IMAGINED, *arguments], capture_output=True, text=True)
+            seconds = time.perf_counter() - start if "imagined" in done.stdout else None
     return seconds

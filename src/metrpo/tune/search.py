@@ -114,6 +114,7 @@ class Search:
         """The runs of trial `number`, one for each seed."""
         overrides = (*self._fixed, *values.items())
         folder = f"trial-{number:03d}"
+        assert self.system is not None, "chosen when the search was made"
         return [RunSpec(self.task, self.system, seed, overrides, self.preset, folder) for seed in self.seeds]
 
     @property
