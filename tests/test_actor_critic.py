@@ -11,7 +11,7 @@ import pytest
 
 import probe
 from helpers import linear_ensemble
-from metrpo import algorithm, training
+from metrpo import algorithm, external, training
 from metrpo.config import Config
 from metrpo.errors import ConfigError
 from metrpo.policy import squashed
@@ -19,6 +19,7 @@ from metrpo.policy.inputs import normalised
 from metrpo.presets import override, preset
 from metrpo.run import directory
 from metrpo.run.files import atomic_write
+from metrpo.run.metrics import read_metrics
 from metrpo.run.policy_export import export
 from metrpo.run.policy_file import load_policy
 from metrpo.speed.measure import compilations
@@ -126,6 +127,25 @@ def test_a_run_that_was_resumed_is_the_run_that_never_stopped(tmp_path):
     for name in ("metrics.csv", "policy.npz", "checkpoints/iteration-00003.npz", "checkpoints/iteration-00002.npz"):
         assert (whole / name).read_bytes() == (parts / name).read_bytes(), name
     _policy_acts_as_the_actor_does(whole)
+
+
+def test_its_steps_one_at_a_time_are_the_loop_byte_for_byte(tmp_path):
+    whole, steps = tmp_path / "whole", tmp_path / "steps"
+    train(override(SMALL, {"iterations": 2}), whole)
+    external.begin(override(SMALL, {"iterations": 2}), steps)
+    for _ in range(2):
+        external.collect(steps)
+        external.improve(steps)
+    for name in ("policy.npz", "checkpoints/iteration-00002.npz"):
+        assert (whole / name).read_bytes() == (steps / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("settings", [{"learn_reward": True}, {"history": 2}, {"actor_critic.horizon": 0}])
+def test_it_learns_rewards_sees_the_past_and_does_without_imagined_steps(settings, tmp_path):
+    train(override(SMALL, {"iterations": 2, **settings}), tmp_path)
+    row = read_metrics(tmp_path / "metrics.csv")[-1]
+    assert np.isfinite(row["return_real"])
+    assert row["rejected_steps"] == 0
 
 
 def _policy_acts_as_the_actor_does(run_dir):

@@ -45,6 +45,16 @@ def test_a_position_that_models_do_not_see_goes_on_without_bounds():
     np.testing.assert_allclose(got, [[91.5, 4]])
 
 
+def test_what_is_carried_over_goes_on_without_bounds():
+    """Of three states the last is carried over, so that the data hold the changes of two, and a reward."""
+    known = data(1)
+    wider = known._replace(states=np.concatenate([known.states, known.states[:, :1]], axis=1))
+    bounds = bounds_of(wider, 0.25, carried=(0,))
+    np.testing.assert_array_equal(bounds.least, [-1.5, -1.5, -np.inf, -1.5])
+    got = np.asarray(bounded(bounds, np.zeros((1, 3), np.float32), np.full((1, 4), 3.0, np.float32)))
+    np.testing.assert_allclose(got, [[1.5, 1.5, 3.0, 1.5]])
+
+
 def test_a_model_that_explodes_keeps_a_finite_return():
     ensemble = linear_ensemble([(30 * probe.A, probe.B)])
     starts = np.full((3, 2), 0.5, np.float32)

@@ -27,12 +27,21 @@ class Bounds(NamedTuple):
     """[D]"""
 
 
-def bounds_of(data: Transitions, margin: float, unseen: tuple[int, ...] = ()) -> Bounds:
-    """The range of `data` (host arrays) and `margin` times its width beyond; `unseen` states have no bounds."""
+def bounds_of(data: Transitions, margin: float, unseen: tuple[int, ...] = (), carried: tuple[int, ...] = ()) -> Bounds:
+    """The range of `data` (host arrays) and `margin` times its width beyond; `unseen` states have no bounds.
+
+    Nor have the changes of what is `carried` over (`Task.carried`). The data do not hold them; they lie behind those of
+    the rest of the state.
+    """
     states, changes = (_range(np.asarray(x), margin) for x in (data.states, data.deltas))
+    size = data.states.shape[1] - len(carried)
     for bound, limit in zip(states, (-np.inf, np.inf), strict=True):
         bound[list(unseen)] = limit
-    return Bounds(*states, *changes)
+    least, most = (
+        np.concatenate([x[:size], np.full(len(carried), limit, x.dtype), x[size:]])
+        for x, limit in zip(changes, (-np.inf, np.inf), strict=True)
+    )
+    return Bounds(*states, least, most)
 
 
 def _range(rows: np.ndarray, margin: float) -> tuple[np.ndarray, np.ndarray]:

@@ -90,7 +90,7 @@ def improve_policy(
     iteration, dataset, settings = state.iteration + 1, state.dataset, UpdateSettings.of(config)
     rng, key = rng_of(config.seed, iteration, Stage.IMPROVE), key_of(config.seed, iteration, Stage.IMPROVE)
     known, inputs = shifted(task, dataset.origin), inputs_for(config, task, dataset)
-    bounds = bounds_of(dataset.train, config.actor_critic.margin, task.unseen)
+    bounds = bounds_of(dataset.train, config.actor_critic.margin, task.unseen, task.carried)
     simulator = dataclasses.replace(
         simulator_of(config, known, ensemble, inputs), bounds=bounds, trusted=_trusted(config, ensemble, dataset, rng)
     )
