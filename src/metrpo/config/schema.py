@@ -327,7 +327,7 @@ class ActorCriticConfig:
     """Nats for each action towards which that weight steers the entropy."""
     entropy_learning_rate: float = 3e-4
     """Adam's step size for the logarithm of that weight."""
-    terminal: Literal["mean", "min"] = "mean"
+    terminal: Literal["mean", "min"] = "min"
     """How the critics value the actor's last imagined state: by their mean or their minimum."""
 
     def __post_init__(self) -> None:

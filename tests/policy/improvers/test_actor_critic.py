@@ -274,7 +274,7 @@ def test_without_imagined_steps_it_is_soft_actor_critic():
 
     def objective(actor):
         drawn, log_probs = squashed.sample(actor, jnp.asarray(starts()), jax.random.fold_in(KEY, actor_critic._LAST))
-        said = valued(WIDE, networks.outputs(one.critics, starts(), drawn)).mean(axis=0)
+        said = valued(WIDE, networks.outputs(one.critics, starts(), drawn)).min(axis=0)
         return jnp.mean(said - jnp.exp(one.log_entropy_weight) * log_probs) / WIDE.width
 
     for got, expected in zip(*map(jax.tree.leaves, (gradient, jax.grad(objective)(one.actor))), strict=True):

@@ -3,8 +3,7 @@
 Both learn from the same imagined episodes of a few steps. The critics' targets are the soft return along these and the
 target critics' value where they are cut (value expansion, Feinberg et al. 2018); the actor follows the gradient of the
 same sum through models, actions and critics (stochastic value gradients, Heess et al. 2015; Amos et al. 2021). A
-learned weight steers the actor's entropy (Haarnoja et al. 2018). The mean of the critics for the actor and their
-minimum for the targets: Kubo et al. 2025 (DHMBPO).
+learned weight steers the actor's entropy, and the least of the critics counts (Haarnoja et al. 2018).
 """
 
 from __future__ import annotations
