@@ -40,6 +40,21 @@ def test_what_cannot_fit_is_one_sentence_with_its_size(room, name, value, messag
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("critic_hidden", (10**6, 10**6), "the critics' weights alone take"),
+        ("batch_size", 10**12, "imagined transitions alone take"),
+        ("real_batch", 10**12, "the real transitions of a block alone take"),
+    ],
+)
+def test_an_actor_critic_that_cannot_fit_is_refused_too(name, value, message):
+    plain = dataclasses.replace(preset("Swimmer", "fast", "actor-critic"), task="Probe")
+    config = dataclasses.replace(plain, actor_critic=dataclasses.replace(plain.actor_critic, **{name: value}))
+    with probe.registered(), pytest.raises(ConfigError, match=rf"^actor_critic\.{name}: expected .*{message}"):
+        init(config)
+
+
 @pytest.mark.parametrize("name", ["fast", "paper", "long-horizon"])
 def test_every_preset_fits_into_two_gib(name, monkeypatch):
     monkeypatch.setattr(machine, "memory", lambda: 2 * 2**30)

@@ -68,9 +68,11 @@ def _actor_critic_needs(config: Config, task: Task) -> list[Need]:
     a, row = config.actor_critic, 2 * task.state_size + task.action_size
     critics = a.critics * _weights((task.state_size + task.action_size, *a.critic_hidden, 1)) * _FLOAT * _COPIES
     states = a.batch_size * max(a.horizon * row, a.block * task.state_size) * _FLOAT
+    real = a.block * a.real_batch * row * _FLOAT
     return [
         Need("actor_critic.critic_hidden", a.critic_hidden, "the critics' weights", critics),
         Need("actor_critic.batch_size", a.batch_size, "imagined transitions", states),
+        Need("actor_critic.real_batch", a.real_batch, "the real transitions of a block", real),
     ]
 
 
