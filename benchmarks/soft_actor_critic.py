@@ -2,7 +2,7 @@
 
 `PYTHON benchmarks/soft_actor_critic.py TASK [--seed 0] [--real-steps 100000] [--out DIR]`, with a Python that has
 metrpo and stable-baselines3: its defaults, on the task's own environment, an evaluation without noise every 1,000 real
-steps. Written to DIR (results/sac/TASK/seed-SEED): metrics.csv, and about.json with versions, commit and machine.
+steps. Written to DIR (results/sac/TASK/seed-SEED): metrics.csv, and about.json with versions and commit.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def environment(task: Task) -> gymnasium.Env:
-    """The task's environment, with an end by the clock said apart, as SAC wants it."""
+    """The task's environment, with an end by the time limit said apart, as SAC wants it."""
     return gymnasium.wrappers.TimeLimit(task.make_env(), task.horizon)
 
 

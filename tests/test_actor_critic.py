@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import types
 
 import jax
 import numpy as np
 import pytest
 
 import probe
+from counted_run import run
 from helpers import linear_ensemble
 from metrpo import algorithm, external, training
 from metrpo.config import Config
@@ -22,7 +22,6 @@ from metrpo.run.files import atomic_write
 from metrpo.run.metrics import read_metrics
 from metrpo.run.policy_export import export
 from metrpo.run.policy_file import load_policy
-from metrpo.speed.measure import compilations
 from metrpo.stages import actor_critic_search
 from metrpo.stages.state import inputs_for
 from metrpo.training import train
@@ -66,16 +65,8 @@ def _probe_is_a_task():
 
 @pytest.fixture(scope="module")
 def small():
-    """States (the first included), rows and compilations of four iterations."""
     jax.clear_caches()
-    states, rows, counts = [training.init(SMALL)], [], []
-    for _ in range(SMALL.iterations):
-        with compilations() as seen:
-            state, row = training.step(SMALL, states[-1])
-        states.append(state)
-        rows.append(row)
-        counts.append(len(seen))
-    return types.SimpleNamespace(states=states, rows=rows, counts=counts)
+    return run(SMALL)
 
 
 def equal(one, other):

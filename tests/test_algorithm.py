@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import probe
+from counted_run import run
 from helpers import linear_ensemble, random_ensemble, random_policy, slow_mean
 from metrpo import algorithm, policy_phase, training
 from metrpo.config import AdvantageConfig, Config
@@ -28,7 +29,6 @@ from metrpo.policy.value import linear
 from metrpo.presets import override, preset
 from metrpo.run import clock as clock_module
 from metrpo.run.clock import Clock
-from metrpo.speed.measure import compilations
 from metrpo.stages import ensemble_fit, policy_search, real_steps, records
 from metrpo.world import registry
 
@@ -58,18 +58,6 @@ TINY = override(
 def _probe_is_a_task():
     with probe.registered():
         yield
-
-
-def run(config, iterations=4):
-    """States (the first included), rows and the number of compilations of each iteration."""
-    states, rows, counts = [training.init(config)], [], []
-    for _ in range(iterations):
-        with compilations() as seen:
-            state, row = training.step(config, states[-1])
-        states.append(state)
-        rows.append(row)
-        counts.append(len(seen))
-    return types.SimpleNamespace(states=states, rows=rows, counts=counts)
 
 
 @pytest.fixture(scope="module")

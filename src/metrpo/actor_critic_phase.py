@@ -90,11 +90,9 @@ def _compiled_block(
 
 def reached(simulator: Simulator, learner: Learner, starts: Array, key: Array) -> Pool:
     """The states of imagined episodes from `starts` [N, S], these included, as far as episodes go on."""
-    inputs = simulator.inputs
 
     def act(states: Array, key: Array) -> Array:
-        seen = states if inputs is None else normalised(inputs, states)
-        return squashed.sample(learner.actor, seen, key)[0]
+        return squashed.sample(learner.actor, normalised(simulator.inputs, states), key)[0]
 
     rollouts, _ = imagine(simulator, act, starts, key)
     mask = rollouts.mask

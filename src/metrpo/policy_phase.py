@@ -228,8 +228,6 @@ def simulate(
 ) -> tuple[Trajectories, ImagineInfo]:
     """Imagined episodes as the policy sees them."""
     inputs = simulator.inputs
-    if inputs is None:
-        return imagine(simulator, act, starts, key)
     rollouts, info = imagine(simulator, lambda states, key: act(normalised(inputs, states), key), starts, key)
     states, last = (normalised(inputs, x) for x in (rollouts.states, rollouts.last))
     return rollouts._replace(states=states, last=last), info
@@ -264,10 +262,7 @@ def _compiled_values(
     def values(
         simulator: Simulator, policy: Policy, starts: Float[Array, "N S"], baseline: Baseline
     ) -> Float[Array, "K"]:
-        inputs = simulator.inputs
-
-        def seen(states: Float[Array, "K N S"]) -> Float[Array, "K N S"]:
-            return states if inputs is None else normalised(inputs, states)
+        seen = partial(normalised, simulator.inputs)
 
         def act(states: Float[Array, "K N S"]) -> Float[Array, "K N A"]:
             return gaussian.mean(policy, seen(states))

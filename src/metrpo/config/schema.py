@@ -305,8 +305,8 @@ class ActorCriticConfig:
     branch_steps: int = 20
     """Steps imagined from states of the dataset; updates start in the states that these reach."""
     trust: float = 1.0
-    """These are cut where members disagree by more than this times their disagreement on 95 % of the held-out data; 0:
-    never."""
+    """Imagined steps end where members disagree by more than this times their disagreement on 95 % of the held-out
+    data; 0: never."""
     margin: float = 0.25
     """Imagined states, their changes and learned rewards stay within the data's range, and this times it beyond."""
     block: int = 50

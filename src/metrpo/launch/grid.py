@@ -30,7 +30,7 @@ class Grid:
 
     tasks: tuple[str, ...]
     systems: tuple[str, ...] = ()
-    """None: each task's usual one."""
+    """Empty: each task's usual one."""
     seeds: tuple[int, ...] = (0,)
     preset: Preset = "fast"
     settings: Mapping[str, Sequence[Any]] = field(default_factory=dict)

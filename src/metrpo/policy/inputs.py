@@ -35,9 +35,9 @@ def inputs_of(states: Float[Array, "n S"], unseen: tuple[int, ...] = ()) -> Inpu
     return Inputs(mean.astype(np.float32), scale.astype(np.float32))
 
 
-def normalised(inputs: Inputs, states: Float[Array, "*batch S"]) -> Float[Array, "*batch S"]:
-    """What the policy sees of raw `states`."""
-    return (states - inputs.shift) * inputs.scale
+def normalised(inputs: Inputs | None, states: Float[Array, "*batch S"]) -> Float[Array, "*batch S"]:
+    """What the policy sees of raw `states`; None: the states themselves."""
+    return states if inputs is None else (states - inputs.shift) * inputs.scale
 
 
 def folded(policy: Policy, inputs: Inputs) -> Policy:

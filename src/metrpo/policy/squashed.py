@@ -7,7 +7,7 @@ is stored, played and exported like every other policy (`mean_policy`).
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ import numpy as np
 
 from metrpo.policy import gaussian
 from metrpo.policy.gaussian import Policy
-from metrpo.policy.inputs import Inputs, folded
+from metrpo.policy.inputs import Inputs, folded, normalised
 from metrpo.types import Array
 
 LOG_STD = (-5.0, 2.0)
@@ -70,9 +70,9 @@ def mean_policy(actor: Actor, inputs: Inputs | None, states: np.ndarray) -> Poli
     size = len(biases) // 2
     identity = np.eye(size, dtype=np.float32), np.zeros(size, np.float32)
     policy = Policy((*inner, (weights[:, :size], biases[:size]), identity), np.zeros(size, np.float32))
-    seen: Any = states if inputs is None else (states - inputs.shift) * inputs.scale
     if len(states):
-        policy = policy._replace(log_std=moments(on_host(actor), seen)[1].mean(axis=0, dtype=np.float32))
+        log_std = moments(on_host(actor), normalised(inputs, states))[1]
+        policy = policy._replace(log_std=log_std.mean(axis=0, dtype=np.float32))
     return policy if inputs is None else folded(policy, inputs)
 
 

@@ -219,7 +219,7 @@ def actor_critic() -> Repetition:
             entropies.append(log_probability)
             states = following
         actions, log_probability = sample(states)
-        value = torch.stack([critic(states, actions) for critic in critics]).mean(dim=0) - weight * log_probability
+        value = torch.stack([critic(states, actions) for critic in critics]).amin(dim=0) - weight * log_probability
         with torch.no_grad():
             least = torch.stack([target(states, actions) for target in targets]).amin(dim=0)
             aim = least - weight * log_probability

@@ -26,7 +26,7 @@ from metrpo.policy import gaussian, squashed
 from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers import actor_critic
 from metrpo.policy.improvers.actor_critic import Learner, Steps, UpdateInfo, UpdateSettings
-from metrpo.policy.inputs import Inputs, normalised
+from metrpo.policy.inputs import normalised
 from metrpo.policy.stopping import improved
 from metrpo.policy.value.critics import Scale, rescaled, scale_of
 from metrpo.policy_phase import PhaseInfo, simulator_of, values_of
@@ -73,7 +73,7 @@ def explorer(config: Config, task: Task, state: State) -> Callable[[np.random.Ge
         def act(observed: np.ndarray) -> np.ndarray:
             if at_random:
                 return rng.uniform(-1.0, 1.0, task.action_size)
-            return squashed.draw(actor, observed if inputs is None else normalised(inputs, observed), rng)
+            return squashed.draw(actor, normalised(inputs, observed), rng)
 
         return of_real(act, state.origin)
 
@@ -96,7 +96,9 @@ def improve_policy(
     )
     real_steps = _real_steps(known, ensemble, dataset)
     before = learner = _in_units(state, scale_of(real_steps.rewards, settings.discount, bool(task.terminated)))
-    real_steps = _seen(inputs, real_steps)
+    real_steps = real_steps._replace(
+        states=normalised(inputs, real_steps.states), following=normalised(inputs, real_steps.following)
+    )
     infos: list[tuple[UpdateInfo, ImagineInfo]] = []
     block, blocks = config.actor_critic.block, _blocks(config, state.real_steps)
     for number in range(blocks):
@@ -113,7 +115,7 @@ def improve_policy(
     policies = [squashed.mean_policy(x.actor, inputs, seen) for x in (before, learner)]
     with clock("validate"):
         values = _values(config, simulator, policies, dataset.starts)
-    shown = seen if inputs is None else normalised(inputs, seen)
+    shown = normalised(inputs, seen)
     info = PhaseInfo(
         values=values[1],
         updates=blocks * block,
@@ -152,13 +154,6 @@ def _real_steps(task: Task, ensemble: Ensemble, dataset: Dataset) -> Steps:
     following, rewards, ended = outcome(task.reward, task.terminated, states, actions, predicted)
     going_on = np.ones(len(states)) if ended is None else 1.0 - np.asarray(ended)
     return Steps(states, actions, np.asarray(rewards, np.float32), following, going_on.astype(np.float32))
-
-
-def _seen(inputs: Inputs | None, steps: Steps) -> Steps:
-    """The same steps in states as the actor sees them."""
-    if inputs is None:
-        return steps
-    return steps._replace(states=normalised(inputs, steps.states), following=normalised(inputs, steps.following))
 
 
 def _trusted(config: Config, ensemble: Ensemble, dataset: Dataset, rng: np.random.Generator) -> Array | None:

@@ -123,11 +123,11 @@ def update(
     if settings.actor_critic.horizon:
         lessons = jax.tree.map(lambda *xs: jnp.concatenate(xs), lessons, expanded(settings, learner, rollouts, last))
     loss, value, critic_gradient = _critic_gradient(learner, lessons)
-    at_first = (rollouts.noted[0], rollouts.mask[0]) if settings.actor_critic.horizon else (last[2], rollouts.going_on)
-    entropy = _mean(-at_first[0], at_first[1])
+    log_probs, counts = _at_first(rollouts, last[2])
+    entropy = _mean(-log_probs, counts)
     new = _stepped(settings, learner, gradient, critic_gradient, entropy)
     leaves = jax.tree.leaves((new, gradient, critic_gradient, loss))
-    sound = (jnp.sum(at_first[1]) > 0) & jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
+    sound = (jnp.sum(counts) > 0) & jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
     new = jax.tree.map(lambda now, before: jnp.where(sound, now, before), new, learner)
     info = UpdateInfo(loss, value, entropy, optax.tree.norm(gradient), sound)
     return new, jax.tree.map(lambda x: jnp.where(sound, x, jnp.zeros_like(x)), info), imagined
@@ -149,18 +149,22 @@ def actor_gradient(
         actions, log_probs = squashed.sample(actor, rollouts.last, last_key)
         said = critic_networks.outputs(learner.critics, rollouts.last, actions)
         after = valued(learner.scale, jnp.mean(said, axis=0) if a.terminal == "mean" else jnp.min(said, axis=0))
-        if a.horizon:
-            _, first = soft_returns(rollouts, weight, settings.discount, after - weight * log_probs)
-            mask = rollouts.mask[0]
-        else:
-            first, mask = after - weight * log_probs, rollouts.going_on
-        # Diverged episodes have a mask of 0, but what they met may be no number.
-        summed = jnp.sum(jnp.where(mask > 0, first, 0.0)) / learner.scale.width
+        _, first = soft_returns(rollouts, weight, settings.discount, after - weight * log_probs)
+        # Diverged episodes do not count, but what they met may be no number.
+        counts = _at_first(rollouts, log_probs)[1]
+        summed = jnp.sum(jnp.where(counts > 0, first, 0.0)) / learner.scale.width
         return summed, (rollouts, (rollouts.last, actions, log_probs), imagined)
 
     gradient, happened = jax.grad(total, has_aux=True)(learner.actor)
     count = across(jnp.float32(starts.shape[0]))
     return jax.tree.map(lambda g: g / count, across(gradient)), jax.lax.stop_gradient(happened)
+
+
+def _at_first(rollouts: Trajectories, last_log_probs: Array) -> tuple[Array, Array]:
+    """Of the states that episodes start in: log-probabilities of actions there, and 1 where one counts, [N] each."""
+    if len(rollouts.mask):
+        return rollouts.noted[0], rollouts.mask[0]
+    return last_log_probs, rollouts.going_on  # no step is imagined: the last state is the first
 
 
 def soft_returns(rollouts: Trajectories, weight: Array, discount: float, after: Array) -> tuple[Array, Array]:
@@ -176,7 +180,7 @@ def soft_returns(rollouts: Trajectories, weight: Array, discount: float, after: 
         return jnp.where(moves > 0, value - weight * log_prob, following), value
 
     # An episode that ends at a step has a mask of 0 from the next one on.
-    goes_on = jnp.concatenate([rollouts.mask[1:], rollouts.going_on[None]])
+    goes_on = jnp.concatenate([rollouts.mask, rollouts.going_on[None]])[1:]
     steps = (rollouts.rewards, rollouts.noted, rollouts.mask, goes_on, _moves(rollouts))
     first, values = jax.lax.scan(back, after, steps, reverse=True)
     return values, first
