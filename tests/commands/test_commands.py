@@ -1,6 +1,7 @@
 """The command line: wrong input gets one clear message and exit code 2, and leaves every file as it was."""
 
 import dataclasses
+import itertools
 import json
 import os
 import re
@@ -405,6 +406,21 @@ def test_switches_and_methods_read_the_right_way(capsys, monkeypatch):
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "ppo and ddpg are Stable-Baselines3's" in text, "the system"
     assert "This ppo learns in the ensemble" in text, "the improver"
+
+
+def test_help_fills_its_lines(capsys, monkeypatch):
+    """Where the source breaks a line says nothing to a reader."""
+    monkeypatch.setenv("COLUMNS", "100")
+    assert run("train", "--help-all") == 0
+    texts = (line.replace("│", " ").rstrip() for line in capsys.readouterr().out.splitlines())
+    lines = [line for line in texts if line.startswith(" " * 8)]
+    assert len(lines) > 150
+    broken = [
+        (line, following)
+        for line, following in itertools.pairwise(lines)
+        if line[-1:].isalpha() and following.strip()[:1].islower() and len(f"{line} {following.split()[0]}") < 97
+    ]
+    assert not broken
 
 
 @pytest.mark.parametrize("preset_", ["fast", "paper"])
