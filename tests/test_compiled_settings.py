@@ -18,7 +18,7 @@ from metrpo.policy.improvers.settings import PhaseSettings
 from metrpo.policy.stopping import RULES
 from metrpo.policy.value.value_table import VALUE_FUNCTIONS
 from metrpo.presets import override
-from metrpo.stages.search import SEARCHES
+from metrpo.stages.search_table import SEARCHES
 
 ROOMS = ("algorithm", "stages", "policy_phase", "actor_critic_phase", "model", "policy", "baselines")
 CHOICES = [

@@ -34,7 +34,7 @@ from metrpo.stages.log import Log, Unkept, left_out
 from metrpo.stages.proven import prove, settle, steps_kept_for_proof
 from metrpo.stages.real_steps import collect
 from metrpo.stages.records import NOTHING, Done, Real, record
-from metrpo.stages.search import SEARCHES, improve_policy
+from metrpo.stages.search_table import SEARCHES, improve_policy
 from metrpo.stages.state import Proven, State, inputs_for
 from metrpo.types import Episode
 from metrpo.world import dataset as datasets

@@ -412,7 +412,7 @@ Method = Literal["model-based", "trpo", "ppo", "ddpg", "svg"]
 """The training loops: model-based, or a baseline in the real environment."""
 
 ImproverName = Literal["trpo", "ppo", "vpg", "bptt", "bptt-stochastic", "actor-critic"]
-"""The rows of `metrpo.stages.search.SEARCHES`."""
+"""The rows of `metrpo.stages.search_table.SEARCHES`."""
 
 Preset = Literal["fast", "paper", "long-horizon"]
 """Names of the presets (see `metrpo.presets`)."""

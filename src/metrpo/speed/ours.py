@@ -29,7 +29,7 @@ from metrpo.policy.improvers import actor_critic, trpo
 from metrpo.policy.improvers.actor_critic import Steps, UpdateSettings
 from metrpo.policy.improvers.batch import Batch
 from metrpo.policy.value import linear
-from metrpo.policy.value.critics import Scale
+from metrpo.policy.value.critics import ValueScale
 from metrpo.presets import override, preset
 from metrpo.types import Array, Trajectories, Transitions
 from metrpo.world import collection as real
@@ -221,7 +221,7 @@ def _actor_critic() -> Work:
     config = preset(TASK, "fast", "actor-critic")
     settings, task, a = UpdateSettings.of(config), _task(), config.actor_critic
     learner = actor_critic.init(settings, jax.random.key(2), STATE, ACTION, config.policy.hidden)
-    learner = learner._replace(scale=Scale(*map(jnp.float32, (0.0, 1.0, -100.0, 100.0))))
+    learner = learner._replace(scale=ValueScale(*map(jnp.float32, (0.0, 1.0, -100.0, 100.0))))
     models = _ensemble("200x3")
     simulator = Simulator(models, task.reward, task.terminated, a.horizon, trusted=jnp.float32(1e6))
     states, actions, deltas, _ = _data(a.block * a.real_batch)

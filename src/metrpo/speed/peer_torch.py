@@ -159,7 +159,7 @@ def conjugate_gradient(product: Callable[[Any], Any], target: Any) -> tuple[Any,
 CRITICS, STARTS, STEPS, DISCOUNT, WEIGHT, TARGET_RATE = 2, 256, 3, 0.99, 0.1, 0.005
 
 
-class Critic(torch.nn.Module):
+class TorchCritic(torch.nn.Module):
     """Values states and actions: layers of 256 and 256, normalised."""
 
     def __init__(self) -> None:
@@ -177,8 +177,8 @@ class Critic(torch.nn.Module):
 def actor_critic() -> Repetition:
     """An update of actor, critics and entropy weight on short rollouts, and on as many real transitions."""
     torch.manual_seed(3)
-    layers, critics = networks("200x3"), [Critic() for _ in range(CRITICS)]
-    targets = [Critic() for _ in range(CRITICS)]
+    layers, critics = networks("200x3"), [TorchCritic() for _ in range(CRITICS)]
+    targets = [TorchCritic() for _ in range(CRITICS)]
     actor = torch.nn.Sequential(
         *(torch.nn.Linear(STATE, 256), torch.nn.Tanh(), torch.nn.Linear(256, 256), torch.nn.Tanh()),
         torch.nn.Linear(256, 2 * ACTION),

@@ -28,7 +28,7 @@ from metrpo.policy.improvers import actor_critic
 from metrpo.policy.improvers.actor_critic import Learner, Steps, UpdateInfo, UpdateSettings
 from metrpo.policy.inputs import normalised
 from metrpo.policy.stopping import improved
-from metrpo.policy.value.critics import Scale, rescaled, scale_of
+from metrpo.policy.value.critics import ValueScale, rescaled, scale_of
 from metrpo.policy_phase import PhaseInfo, simulator_of, values_of
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of, rng_of
@@ -136,7 +136,7 @@ def _blocks(config: Config, real_steps: int) -> int:
     return max(1, round(updates / config.actor_critic.block))
 
 
-def _in_units(state: State, scale: Scale) -> Learner:
+def _in_units(state: State, scale: ValueScale) -> Learner:
     """The learner with critics in the units of the data as they are now."""
     learner: Learner = state.baseline
     if state.iteration == 0:  # it says the middle of what is possible, whatever that turns out to be

@@ -14,7 +14,7 @@ from metrpo.errors import EpisodeError, NotFiniteError
 from metrpo.finite import naming
 from metrpo.seeds import Stage, rng_of
 from metrpo.stages.log import Log, Unkept, left_out
-from metrpo.stages.search import SEARCHES
+from metrpo.stages.search_table import SEARCHES
 from metrpo.stages.state import State
 from metrpo.types import Episode
 from metrpo.world import collection as real

@@ -352,7 +352,7 @@ def test_what_the_store_raises_is_raised_on_the_other_machine(kept, out, monkeyp
     def method(name):
         return SimpleNamespace(remote=lambda *arguments: lambda: getattr(kept, name)(*arguments))
 
-    actor = sync.Actor(SimpleNamespace(begin=method("begin"), take=method("take"), end=method("end")))
+    actor = sync.RayActor(SimpleNamespace(begin=method("begin"), take=method("take"), end=method("end")))
     assert actor.begin(RUN) == (1, {})
     actor.take(RUN, 1, changes([("metrics.csv", b"1")]))
     assert (out / RUN / "metrics.csv").read_text() == "1"

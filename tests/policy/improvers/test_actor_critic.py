@@ -27,7 +27,7 @@ from metrpo.policy.improvers.actor_critic import (
 )
 from metrpo.policy.squashed import Actor
 from metrpo.policy.value import critics as networks
-from metrpo.policy.value.critics import Scale, valued
+from metrpo.policy.value.critics import ValueScale, valued
 from metrpo.policy_phase import simulate
 from metrpo.presets import override
 from metrpo.types import Trajectories
@@ -44,7 +44,7 @@ CONFIG = override(
     },
 )
 SETTINGS = UpdateSettings.of(CONFIG)
-WIDE = Scale(*map(np.float32, (1.0, 8.0, -1e6, 1e6)))
+WIDE = ValueScale(*map(np.float32, (1.0, 8.0, -1e6, 1e6)))
 
 
 def learner(settings=SETTINGS, seed=0):

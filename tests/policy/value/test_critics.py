@@ -8,7 +8,7 @@ import pytest
 
 from helpers import on_host
 from metrpo.policy.value import critics as networks
-from metrpo.policy.value.critics import Scale, averaged, rescaled, scale_of, valued
+from metrpo.policy.value.critics import ValueScale, averaged, rescaled, scale_of, valued
 
 KEY = jax.random.key(0)
 
@@ -49,7 +49,7 @@ def test_fresh_critics_say_the_middle_and_differ_in_what_they_will_learn():
 def test_other_units_change_nothing_of_what_critics_value(middle, width):
     critics, rng = spoken(), np.random.default_rng(2)
     states, actions = rng.normal(size=(6, 3)).astype(np.float32), rng.normal(size=(6, 2)).astype(np.float32)
-    old, new = (Scale(*map(np.float32, x)) for x in ((5.0, 3.0, 0, 0), (middle, width, 0, 0)))
+    old, new = (ValueScale(*map(np.float32, x)) for x in ((5.0, 3.0, 0, 0), (middle, width, 0, 0)))
     before = valued(old, networks.outputs(critics, states, actions))
     after = valued(new, networks.outputs(rescaled(critics, old, new), states, actions))
     np.testing.assert_allclose(after, before, rtol=1e-4)

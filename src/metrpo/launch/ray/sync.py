@@ -26,7 +26,7 @@ _POLL = 1.0
 """Seconds between two checks whether a run directory is free."""
 
 
-class Actor:
+class RayActor:
     """A `Store` as a Ray actor: each call returns when it is finished, and raises what the store raised."""
 
     def __init__(self, handle: Any) -> None:
@@ -44,7 +44,7 @@ class Actor:
         self.begin, self.take, self.end = call(handle.begin), call(handle.take), call(handle.end)
 
 
-Keeper = Store | Actor
+Keeper = Store | RayActor
 
 
 def rank(name: str) -> tuple[int, str]:
@@ -119,7 +119,7 @@ def attend(order: worker.Order, run: str, keeper: Keeper) -> worker.Ended:
 
 def attend_for(order: worker.Order, run: str, handle: Any) -> worker.Ended:
     """`attend` for the store that is the actor `handle`: what a machine of the cluster does for one run."""
-    return attend(order, run, Actor(handle))
+    return attend(order, run, RayActor(handle))
 
 
 def start_store(ray: Any, out: Path) -> Any:

@@ -20,7 +20,7 @@ from metrpo.devices import across, share_of
 from metrpo.policy import squashed
 from metrpo.policy.squashed import Actor
 from metrpo.policy.value import critics as critic_networks
-from metrpo.policy.value.critics import Critics, Scale, averaged, valued
+from metrpo.policy.value.critics import Critics, ValueScale, averaged, valued
 from metrpo.types import Array, Simulate, Trajectories
 
 _LAST, _REAL = 2**31 - 3, 2**31 - 2
@@ -59,7 +59,7 @@ class Learner(NamedTuple):
     log_entropy_weight: Array
     """[]"""
     moments: Moments
-    scale: Scale
+    scale: ValueScale
 
 
 class Steps(NamedTuple):
@@ -101,7 +101,7 @@ def init(settings: UpdateSettings, key: Array, state_size: int, action_size: int
     of_actor, of_critics, of_entropy = _optimizers(settings)
     moments = Moments(of_actor.init(actor), of_critics.init(critics), of_entropy.init(log_weight))
     one, zero = jnp.float32(1), jnp.float32(0)
-    return Learner(actor, critics, critics, log_weight, moments, Scale(zero, one, zero, zero))
+    return Learner(actor, critics, critics, log_weight, moments, ValueScale(zero, one, zero, zero))
 
 
 def _optimizers(settings: UpdateSettings) -> tuple[optax.GradientTransformation, ...]:

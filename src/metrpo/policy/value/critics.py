@@ -1,7 +1,7 @@
 """Critics: networks that value a state and an action, several at once and unlike each other.
 
-Each says how much the soft return is above the middle of what is possible, in half its width (`Scale`); hidden layers
-are normalised (Ba et al. 2016), without which an off-policy critic that leans on itself may run away.
+Each says how much the soft return is above the middle of what is possible, in units of `ValueScale`; hidden layers are
+normalised (Ba et al. 2016), without which an off-policy critic that leans on itself may run away.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _VARIES = 0.25
 """By how much values differ from state to state, in parts of what a reward's std would add up to if it lasted."""
 
 
-class Scale(NamedTuple):
+class ValueScale(NamedTuple):
     """Units of the critics' outputs: a value is middle + width * output."""
 
     middle: Array
@@ -66,12 +66,12 @@ def _normalised(x: Array) -> Array:
     return centred * jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=-1, keepdims=True) + 1e-5)
 
 
-def valued(scale: Scale, outputs: Array) -> Array:
+def valued(scale: ValueScale, outputs: Array) -> Array:
     """Outputs as soft returns."""
     return scale.middle + scale.width * outputs
 
 
-def scale_of(rewards: np.ndarray, discount: float, ends: bool) -> Scale:
+def scale_of(rewards: np.ndarray, discount: float, ends: bool) -> ValueScale:
     """The units for `rewards` [n] of real steps; where episodes may end, nothing follows, which is worth 0.
 
     The middle is what their mean adds up to, or that 0: critics begin there, and a value is long in coming from afar.
@@ -84,10 +84,10 @@ def scale_of(rewards: np.ndarray, discount: float, ends: bool) -> Scale:
     width = std if std > 1e-6 * abs(mean) else max(abs(mean), 1.0)
     slack = max(highest - lowest, width)
     numbers = (mean, _VARIES * width, lowest - slack, highest + slack)
-    return Scale(*(np.float32(reach * number) for number in numbers))
+    return ValueScale(*(np.float32(reach * number) for number in numbers))
 
 
-def rescaled(critics: Critics, old: Scale, new: Scale) -> Critics:
+def rescaled(critics: Critics, old: ValueScale, new: ValueScale) -> Critics:
     """Critics that say in the `new` units what they said in the `old` ones (van Hasselt et al. 2016)."""
     ratio, shift = old.width / new.width, (old.middle - new.middle) / new.width
 

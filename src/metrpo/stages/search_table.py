@@ -18,7 +18,8 @@ from metrpo.policy.improvers.improver_table import IMPROVERS
 from metrpo.policy.value.value_table import Baseline
 from metrpo.policy_phase import PhaseInfo
 from metrpo.run.clock import Clock
-from metrpo.stages import actor_critic_search, policy_search
+from metrpo.stages import actor_critic_search as by_critics
+from metrpo.stages import policy_search as in_phases
 from metrpo.stages.state import State
 from metrpo.types import Array
 from metrpo.world import collection as real
@@ -30,7 +31,7 @@ Explorer = Callable[[Config, Task, State], Callable[[np.random.Generator], real.
 """What acts in real episodes."""
 
 
-class Improve(Protocol):
+class ImprovePolicy(Protocol):
     """The signature of every search."""
 
     def __call__(
@@ -39,18 +40,18 @@ class Improve(Protocol):
         """The policy, what it learns with and what happened; `state` holds the data that the ensemble is fitted to."""
 
 
-class Search(NamedTuple):
+class PolicySearch(NamedTuple):
     """A row of the table."""
 
     fresh: Fresh
     explorer: Explorer
-    improve: Improve
+    improve: ImprovePolicy
 
 
-_IN_PHASES = Search(policy_search.fresh, policy_search.explorer, policy_search.improve_policy)
+_IN_PHASES = PolicySearch(in_phases.fresh, in_phases.explorer, in_phases.improve_policy)
 """The paper's: updates on imagined episodes until the models no longer agree that the policy improves."""
-_ACTOR_CRITIC = Search(actor_critic_search.fresh, actor_critic_search.explorer, actor_critic_search.improve_policy)
-SEARCHES: dict[str, Search] = {**dict.fromkeys(IMPROVERS, _IN_PHASES), "actor-critic": _ACTOR_CRITIC}
+_BY_CRITICS = PolicySearch(by_critics.fresh, by_critics.explorer, by_critics.improve_policy)
+SEARCHES: dict[str, PolicySearch] = {**dict.fromkeys(IMPROVERS, _IN_PHASES), "actor-critic": _BY_CRITICS}
 """By `Config.improver`."""
 
 
