@@ -130,16 +130,25 @@ def of_one_observation(ensemble):
     n = n._replace(delta_mean=n.delta_mean[:1], delta_std=n.delta_std[:1])
     return Ensemble((*inner, (weights[..., :1], biases[..., :1])), n, Carried(History(2, 1, 2).carried))
 
+def probabilistic(ensemble):
+    *inner, (weights, biases) = ensemble.networks
+    spread = (0.1 * weights, biases - 2.0)
+    doubled = tuple(np.concatenate(pair, axis=-1) for pair in zip((weights, biases), spread, strict=True))
+    return ensemble._replace(networks=(*inner, doubled))
+
 for members, count, hidden, sampling, curiosity in (
     (3, 2, (16,), "step_rand", "history"),
     (3, 4, (16,), "step_rand", 0.0),  # all three cut in four
     (4, 2, (16,), "eps_rand", 0.0),  # two each
     (5, 4, (16, 8, 8, 16), "step_rand", 0.1),
     (3, 2, (16, 16), "step_rand", 0.0),  # one each, and one cut in two
+    (3, 2, (16,), "step_rand", "noise"),
 ):
     ensemble = random_ensemble(members=members, scale=0.3, hidden=hidden)
     if curiosity == "history":
         ensemble, curiosity = of_one_observation(ensemble), 0.0
+    if curiosity == "noise":
+        ensemble, curiosity = probabilistic(ensemble), 0.0
     rows = 24 // count // members  # for each model, on a device with models of its own
     apart = found(ensemble, count, rows, sampling, curiosity)
     assert not divided

@@ -34,6 +34,7 @@ CITED = {
     "collect.max_validation": (100_000, "code: first in, first out"),
     "ensemble.members": (5, 'B, "Ablation study": ME-TRPO with 5 models'),
     "ensemble.hidden": ((1024, 1024), "A.1.2: hidden sizes 1024-1024"),
+    "ensemble.probabilistic": (False, "equation 1: the L2 norm of the error alone"),
     "ensemble.std_floor": (0.1, "code: floor of the normaliser"),
     "ensemble.delta_std_floor": (0.1, "code: floor of the normaliser, one for inputs and outputs"),
     "fit.learning_rate": (0.001, "A.1.2: Adam with learning rate 0.001"),

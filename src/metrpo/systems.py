@@ -31,6 +31,7 @@ ACTOR_CRITIC: Overrides = {
     "collect.piece": 50,
     "collect.steps": 1000,
     "collect.validation_fraction": 0.1,
+    "ensemble.probabilistic": True,
     "evaluation_episodes": 5,
     "fit.max_steps": 1000,
     "imagine.start": "anywhere",

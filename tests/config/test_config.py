@@ -196,6 +196,7 @@ FREE = {
     "policy.normalise",
 }
 FREE |= {
+    "ensemble.probabilistic",
     "validate.rule",
     "actor_critic.terminal",
     "fit.products",

@@ -77,6 +77,8 @@ class EnsembleConfig:
     """The normaliser divides states and actions by their standard deviation, but at least by this."""
     delta_std_floor: float = 0.1
     """The normaliser multiplies outputs by the standard deviation of state changes, but at least by this."""
+    probabilistic: bool = False
+    """Members also predict how far off they are; imagined steps are drawn with that spread."""
 
     def __post_init__(self) -> None:
         require(self.members >= 1, "ensemble.members", self.members, "at least 1")

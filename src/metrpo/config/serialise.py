@@ -18,6 +18,7 @@ from metrpo.safe_load import brief, json_of
 ADDED = (
     "config.collect.std_power",
     "config.collect.noise_correlation",
+    "config.ensemble.probabilistic",
     "config.fit.products",
     "config.policy.normalise",
     "config.policy.min_std",

@@ -22,6 +22,10 @@ Networks = tuple[tuple[Float[Array, "K _in _out"], Float[Array, "K 1 _out"]], ..
 """One (weights, biases) a layer."""
 
 
+LOG_SPREAD = (-7.0, 1.0)
+"""Bounds of the log of a probabilistic member's spread, in standard deviations of a change."""
+
+
 @jax.tree_util.register_static
 @dataclass(frozen=True)
 class Carried:
@@ -43,9 +47,9 @@ class Ensemble(NamedTuple):
         """K."""
         return int(self.networks[0][0].shape[0])
 
-    def outputs(self, x: Float[Array, "K B I"]) -> Float[Array, "K B D"]:
+    def outputs(self, x: Float[Array, "K B I"]) -> Float[Array, "K B E"]:
         """What the networks say, each member to its own batch."""
-        return network_outputs(self.networks, x)
+        return network_outputs(self.networks, x, self.normaliser.delta_std.shape[-1])
 
     def first(self) -> Ensemble:
         """The first member as an ensemble of one."""
@@ -59,12 +63,14 @@ def init(
     action_size: int,
     hidden: tuple[int, ...],
     predicted: int | None = None,
+    probabilistic: bool = False,
 ) -> Networks:
     """Fresh networks: Xavier-uniform weights, zero biases. Member k depends on `key` and k alone, not on K.
 
-    They have as many outputs as numbers are `predicted`; by default those of the state.
+    They have as many outputs as numbers are `predicted`, by default those of the state; `probabilistic` ones twice as
+    many, for the log of each number's spread.
     """
-    sizes = (state_size + action_size, *hidden, predicted or state_size)
+    sizes = (state_size + action_size, *hidden, (predicted or state_size) * (2 if probabilistic else 1))
 
     def one(k: Int[Array, ""]) -> tuple[tuple[Float[Array, "_in _out"], Float[Array, "1 _out"]], ...]:
         keys = jax.random.split(jax.random.fold_in(key, k), len(sizes) - 1)
@@ -122,7 +128,7 @@ class Predictor(Protocol):
     def carried(self) -> Carried:
         """What of the next state they need not predict."""
 
-    def outputs(self, x: Float[Array, "K B I"]) -> Float[Array, "K B D"]:
+    def outputs(self, x: Float[Array, "K B I"]) -> Float[Array, "K B E"]:
         """What the networks say, each member to its own batch."""
 
     def first(self) -> Predictor:
@@ -130,17 +136,23 @@ class Predictor(Protocol):
 
 
 def predict(
-    ensemble: Predictor, states: Float[Array, "K B S"], actions: Float[Array, "K B A"]
+    ensemble: Predictor,
+    states: Float[Array, "K B S"],
+    actions: Float[Array, "K B A"],
+    key: Key[Array, ""] | None = None,
 ) -> Float[Array, "K B P"]:
-    """Next states and what else is learned, each member for its own batch."""
-    return with_carried(ensemble, states, actions, predict_changing(ensemble, states, actions))
+    """Next states and what else is learned, each member for its own batch; by `key`, with noise (`predict_delta`)."""
+    return with_carried(ensemble, states, actions, predict_changing(ensemble, states, actions, key))
 
 
 def predict_changing(
-    ensemble: Predictor, states: Float[Array, "K B S"], actions: Float[Array, "K B A"]
+    ensemble: Predictor,
+    states: Float[Array, "K B S"],
+    actions: Float[Array, "K B A"],
+    key: Key[Array, ""] | None = None,
 ) -> Float[Array, "K B D"]:
     """As `predict`, without what is carried over."""
-    deltas = predict_delta(ensemble, states, actions)
+    deltas = predict_delta(ensemble, states, actions, key)
     size = states.shape[-1] - len(ensemble.carried.indices)
     seen = states[..., :size]
     if deltas.shape[-1] == size:
@@ -164,22 +176,48 @@ def with_carried(
 
 
 def predict_delta(
-    ensemble: Predictor, states: Float[Array, "K B S"], actions: Float[Array, "K B A"]
+    ensemble: Predictor,
+    states: Float[Array, "K B S"],
+    actions: Float[Array, "K B A"],
+    key: Key[Array, ""] | None = None,
 ) -> Float[Array, "K B D"]:
-    """Changes of state, without what is carried over, and what else is learned, each member for its own batch."""
+    """Changes of state, without what is carried over, and what else is learned, each member for its own batch.
+
+    Of probabilistic members a draw where there is a `key`, else the mean.
+    """
+    n, (means, log_spread) = ensemble.normaliser, mean_and_spread(ensemble, states, actions)
+    if key is not None and log_spread is not None:
+        means = means + jnp.exp(jax.lax.stop_gradient(log_spread)) * jax.random.normal(key, means.shape)
+    return n.delta_mean + n.delta_std * means
+
+
+def mean_and_spread(
+    ensemble: Predictor, states: Float[Array, "K B S"], actions: Float[Array, "K B A"]
+) -> tuple[Float[Array, "K B D"], Float[Array, "K B D"] | None]:
+    """What members expect, and the log of the spread around it (None: not probabilistic), in the normaliser's units."""
     n = ensemble.normaliser
     inputs = jnp.concatenate(
         [(states - n.state_mean) * n.state_scale, (actions - n.action_mean) * n.action_scale], axis=-1
     )
-    return n.delta_mean + n.delta_std * ensemble.outputs(inputs)
+    said, size = ensemble.outputs(inputs), n.delta_std.shape[-1]
+    if said.shape[-1] == size:
+        return said, None
+    return said[..., :size], said[..., size:].clip(*LOG_SPREAD)
 
 
-def network_outputs(networks: Networks, x: Float[Array, "K B I"]) -> Float[Array, "K B D"]:
-    """What the networks say, each member to its own batch."""
-    *inner, last = networks
-    for weights, biases in inner:
-        x = jax.nn.relu(layer_outputs(x, weights, biases))
-    return layer_outputs(x, *last)
+def network_outputs(networks: Networks, x: Float[Array, "K B I"], means: int | None = None) -> Float[Array, "K B E"]:
+    """What the networks say, each member to its own batch.
+
+    The outputs after the first `means` (None: all) teach their own weights alone, not the layers before these.
+    """
+    *inner, (weights, biases) = networks
+    for w, b in inner:
+        x = jax.nn.relu(layer_outputs(x, w, b))
+    if means in (None, biases.shape[-1]):
+        return layer_outputs(x, weights, biases)
+    expected = layer_outputs(x, weights[..., :means], biases[..., :means])
+    spread = layer_outputs(jax.lax.stop_gradient(x), weights[..., means:], biases[..., means:])
+    return jnp.concatenate([expected, spread], axis=-1)
 
 
 def layer_outputs(

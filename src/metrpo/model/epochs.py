@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, Key
 
 from metrpo.config import FitConfig
 from metrpo.devices import AXIS, FIRST, WHOLE, spread
-from metrpo.model.ensemble import Ensemble, Networks, predict_delta, with_products
+from metrpo.model.ensemble import Ensemble, Networks, mean_and_spread, with_products
 from metrpo.types import Array, Normaliser, Transitions
 
 VALIDATION_CHUNK = 1000
@@ -59,10 +59,28 @@ def loss_of(
 
     In "raw" state units (the paper), or each dimension in units of its "std", so that none drowns another.
     """
-    errors = predict_delta(ensemble, states, actions) - deltas
-    if loss_units == "std":
-        errors = errors / ensemble.normaliser.delta_std
-    return jnp.sum(jnp.square(errors), axis=-1)
+    return _losses(ensemble, loss_units, states, actions, deltas)[0]
+
+
+def _losses(
+    ensemble: Ensemble,
+    loss_units: str,
+    states: Float[Array, "K B S"],
+    actions: Float[Array, "K B A"],
+    deltas: Float[Array, "K B D"],
+) -> tuple[Float[Array, "K B"], Float[Array, "K B"] | float]:
+    """`loss_of`, and how unlikely probabilistic members hold the errors that they make, in nats (others: 0).
+
+    The likelihood's gradient is of the spread alone: the mean learns what it would learn without.
+    """
+    n, (means, log_spread) = ensemble.normaliser, mean_and_spread(ensemble, states, actions)
+    errors = n.delta_mean + n.delta_std * means - deltas
+    in_std = errors / n.delta_std
+    loss = jnp.sum(jnp.square(in_std if loss_units == "std" else errors), axis=-1)
+    if log_spread is None:
+        return loss, 0.0
+    squares = jnp.square(jax.lax.stop_gradient(in_std))
+    return loss, jnp.sum(log_spread + 0.5 * squares * jnp.exp(-2.0 * log_spread), axis=-1)
 
 
 @partial(jax.jit, static_argnames="loss_units")
@@ -115,8 +133,8 @@ def _block(
 
     def total_loss(networks: Networks, *batch: Float[Array, "K B _"]) -> tuple[Float[Array, ""], Float[Array, "K"]]:
         ensemble = Ensemble(with_products(networks, config.products), normaliser)
-        losses = jnp.mean(loss_of(ensemble, config.loss_units, *batch), axis=-1)
-        return jnp.sum(losses), losses
+        losses, surprise = _losses(ensemble, config.loss_units, *batch)
+        return jnp.sum(jnp.mean(losses + surprise, axis=-1)), jnp.mean(losses, axis=-1)
 
     def train_group(group: _Training, numbers: Int[Array, "K"], key: Key[Array, ""]) -> _Training:
         index = minibatch(key, numbers, config.batch_size, train.size)

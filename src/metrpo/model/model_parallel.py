@@ -40,7 +40,7 @@ class SharedEnsemble(NamedTuple):
         own, remaining = (len(networks[0][0]) for networks in (self.own, self.cut))
         return own * jax.lax.axis_size(AXIS) + remaining
 
-    def outputs(self, x: Float[Array, "K B I"]) -> Float[Array, "K B D"]:
+    def outputs(self, x: Float[Array, "K B I"]) -> Float[Array, "K B E"]:
         """What the networks say, each member to its own batch, of this device's states."""
         own, remaining = (len(networks[0][0]) for networks in (self.own, self.cut))
         x = jax.lax.all_gather(x, AXIS, axis=1, tiled=True)
@@ -57,7 +57,7 @@ class SharedEnsemble(NamedTuple):
         """No device has one member by itself: samplings that ask for it are not shared (`Sampling.of_drawn_models`)."""
         raise NotImplementedError("expected a sampling that draws a model for each state, got one of the first member")
 
-    def _summands(self, x: Float[Array, "K B I"]) -> Float[Array, "K B D"]:
+    def _summands(self, x: Float[Array, "K B I"]) -> Float[Array, "K B E"]:
         """This device's part of the remaining members' outputs, which are the sums of the parts."""
         for layer, (weights, biases) in enumerate(self.cut):
             if layer > 0:

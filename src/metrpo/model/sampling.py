@@ -14,6 +14,9 @@ from jaxtyping import Float, Int, Key
 from metrpo.model.ensemble import Predictor, predict, predict_changing, with_carried
 from metrpo.types import Array
 
+_NOISE = 2**31 - 6
+"""Derives the keys of probabilistic members' noise."""
+
 
 def model_choice(
     key: Key[Array, ""], count: int, members: int
@@ -56,24 +59,27 @@ def step_rand(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
 ) -> Float[Array, "N P"]:
     """One model drawn at random for each state and step (paper, section 5)."""
-    return _of_drawn_models(ensemble, states, actions, keys.step)
+    return _of_drawn_models(ensemble, states, actions, keys.step, keys.step)
 
 
 def eps_rand(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
 ) -> Float[Array, "N P"]:
     """One model drawn at random for each episode."""
-    return _of_drawn_models(ensemble, states, actions, keys.episode)
+    return _of_drawn_models(ensemble, states, actions, keys.episode, keys.step)
 
 
 def _of_drawn_models(
-    ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], key: Key[Array, ""]
+    ensemble: Predictor,
+    states: Float[Array, "N S"],
+    actions: Float[Array, "N A"],
+    choice: Key[Array, ""],
+    step: Key[Array, ""],
 ) -> Float[Array, "N P"]:
-    slots, _ = model_choice(key, states.shape[0], ensemble.members)
+    slots, _ = model_choice(choice, states.shape[0], ensemble.members)
     # The blanks repeat the last state; their predictions are dropped.
-    grouped = predict(
-        ensemble, jnp.take(states, slots, axis=0, mode="clip"), jnp.take(actions, slots, axis=0, mode="clip")
-    )
+    states_of_each, actions_of_each = (jnp.take(x, slots, axis=0, mode="clip") for x in (states, actions))
+    grouped = predict(ensemble, states_of_each, actions_of_each, jax.random.fold_in(step, _NOISE))
     return jnp.zeros((states.shape[0], grouped.shape[-1])).at[slots].set(grouped, mode="drop")
 
 
@@ -81,7 +87,7 @@ def one_model(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
 ) -> Float[Array, "N P"]:
     """The first model, always."""
-    return predict(ensemble.first(), states[None], actions[None])[0]
+    return predict(ensemble.first(), states[None], actions[None], jax.random.fold_in(keys.step, _NOISE))[0]
 
 
 def model_mean(

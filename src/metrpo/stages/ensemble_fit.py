@@ -66,4 +66,5 @@ def _named(members: np.ndarray) -> str:
 def fresh_networks(config: Config, task: Task, key: Array) -> Networks:
     """Networks with fresh weights."""
     e = config.ensemble
-    return ensembles.init(key, e.members, task.state_size, task.action_size, e.hidden, task.predicted)
+    sizes = task.state_size, task.action_size, e.hidden, task.predicted
+    return ensembles.init(key, e.members, *sizes, e.probabilistic)
