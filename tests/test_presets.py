@@ -38,6 +38,7 @@ CITED = {
     "ensemble.std_floor": (0.1, "code: floor of the normaliser"),
     "ensemble.delta_std_floor": (0.1, "code: floor of the normaliser, one for inputs and outputs"),
     "fit.learning_rate": (0.001, "A.1.2: Adam with learning rate 0.001"),
+    "fit.decay": (False, "A.1.2: Adam with learning rate 0.001"),
     "fit.batch_size": (1000, "A.1.2: batch size of 1000"),
     "fit.loss_units": ("raw", "equation 1: the L2 norm of the error in the state"),
     "fit.validate_every": (5, "A.1.2: we validate the training every 5 passes"),

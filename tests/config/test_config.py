@@ -31,6 +31,7 @@ _values = st.none() | st.booleans() | st.integers() | st.text()
 OWN = {
     "env_kwargs": st.dictionaries(_names, _values, max_size=3).map(canonical),
     "imports": st.lists(_names, max_size=2).map(tuple),
+    "max_steps": st.integers(1, 10**6),
     "real_episodes": st.just(0) | st.integers(2, 10**6),
 }
 """Settings that are not any value of their type."""
@@ -197,6 +198,7 @@ FREE = {
 }
 FREE |= {
     "ensemble.probabilistic",
+    "fit.decay",
     "validate.rule",
     "actor_critic.terminal",
     "fit.products",
@@ -250,6 +252,12 @@ def test_values_at_the_edge_are_possible(name, value):
     config = override(Config(task="x"), {name: value})
     assert flatten(config)[name] == value
     assert from_json(to_json(config)) == config
+
+
+def test_steps_can_only_fall_to_0_over_a_number_of_them():
+    with pytest.raises(ConfigError, match=r"^fit.max_steps: expected a number of steps with fit.decay, got None$"):
+        override(Config(task="x"), {"fit.decay": True})
+    assert override(Config(task="x"), {"fit.max_steps": 10, "fit.decay": True}).fit.decay
 
 
 def edited(**changes):

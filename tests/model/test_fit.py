@@ -80,6 +80,9 @@ class SlowMember:
         return gradients
 
     def step(self, rows):
+        rate = self.config.learning_rate
+        if self.config.decay:
+            rate *= 0.5 * (1 + np.cos(np.pi * self.steps / self.config.max_steps))
         self.steps += 1
         for layer, moments, gradients in zip(self.layers, self.moments, self.gradient(*rows), strict=True):
             for j, g in enumerate(gradients):
@@ -87,7 +90,7 @@ class SlowMember:
                 moments[j] = first, second
                 first, second = first / (1 - 0.9**self.steps), second / (1 - 0.999**self.steps)
                 decay = self.config.weight_decay * layer[j] if j == 0 else 0.0
-                layer[j] = layer[j] - self.config.learning_rate * (first / (np.sqrt(second) + 1e-8) + decay)
+                layer[j] = layer[j] - rate * (first / (np.sqrt(second) + 1e-8) + decay)
 
     def loss(self, validation):
         networks = tuple((w[None], b[None]) for w, b in self.layers)
@@ -118,9 +121,10 @@ NOISY = FitConfig(learning_rate=0.03, batch_size=10, validate_every=2, max_passe
     [
         (33, NOISY),
         (33, replace(NOISY, loss_units="std", weight_decay=2.0)),
+        (33, replace(NOISY, weight_decay=2.0, decay=True, max_steps=48)),
         (5, replace(NOISY, validate_every=1)),
     ],
-    ids=["minibatches", "decay and units of std", "fewer rows than a minibatch"],
+    ids=["minibatches", "weights decay, units of std", "steps fall to 0", "fewer rows than a minibatch"],
 )
 def test_each_member_trains_alone_and_returns_to_its_own_best(size, config):
     """Each slice equals that member's training by itself; few noisy rows make the best passes differ."""

@@ -109,6 +109,8 @@ class FitConfig:
     """Maximum number of epochs in one outer iteration."""
     max_steps: int | None = None
     """Maximum number of minibatches in one outer iteration. Warm starts carry training on across iterations."""
+    decay: bool = False
+    """Let the step size fall to 0 over max_steps, as half a cosine: large steps learn fast, small ones end well."""
     reinitialise_every: int = 5
     """Start from fresh weights in every n-th outer iteration (1, 1+n, ...), else from the last ones; 0: fresh only in
     the first."""
@@ -119,6 +121,8 @@ class FitConfig:
         for name in ("batch_size", "validate_every", "patience", "max_passes"):
             require(getattr(self, name) >= 1, f"fit.{name}", getattr(self, name), "at least 1")
         require(self.max_steps is None or self.max_steps >= 1, "fit.max_steps", self.max_steps, "at least 1")
+        needed = not self.decay or self.max_steps is not None
+        require(needed, "fit.max_steps", self.max_steps, "a number of steps with fit.decay")
         require(self.reinitialise_every >= 0, "fit.reinitialise_every", self.reinitialise_every, "at least 0")
 
 

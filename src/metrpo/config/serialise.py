@@ -19,6 +19,7 @@ ADDED = (
     "config.collect.std_power",
     "config.collect.noise_correlation",
     "config.ensemble.probabilistic",
+    "config.fit.decay",
     "config.fit.products",
     "config.policy.normalise",
     "config.policy.min_std",

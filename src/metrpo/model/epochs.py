@@ -181,8 +181,11 @@ def _joined(parts: list[Any]) -> Any:
 
 
 def optimizer_of(config: FitConfig) -> optax.GradientTransformation:
-    """Adam, with weight decay on the weights alone."""
-    return optax.adamw(config.learning_rate, weight_decay=config.weight_decay, mask=_weights_only)
+    """Adam, with weight decay on the weights alone, which falls with the step size."""
+    rate: optax.ScalarOrSchedule = config.learning_rate
+    if config.decay and config.max_steps is not None:
+        rate = optax.cosine_decay_schedule(config.learning_rate, config.max_steps)
+    return optax.adamw(rate, weight_decay=config.weight_decay, mask=_weights_only)
 
 
 def _weights_only(networks: Networks) -> tuple[tuple[bool, bool], ...]:
