@@ -239,15 +239,16 @@ def values_of(
     starts: Float[Array, "N S"],
     advantage: AdvantageConfig | None = None,
     baseline: Baseline = None,
+    key: Key[Array, ""] | None = None,
 ) -> Float[np.ndarray, "K"]:
     """Mean return of the deterministic policy from `starts` in each model alone.
 
     Undiscounted over the whole horizon; where the simulator cuts episodes off, discounted as `advantage` says, with the
-    value that `baseline` gives to their last state.
+    value that `baseline` gives to their last state. Probabilistic members predict with noise where there is a `key`.
     """
     mesh = devices.mesh(len(starts))
     simulator, policy, baseline = devices.copied((simulator, policy, baseline), mesh)
-    return np.asarray(_compiled_values(advantage, mesh, simulator, policy, starts, baseline))
+    return np.asarray(_compiled_values(advantage, mesh, simulator, policy, starts, baseline, key))
 
 
 @partial(jax.jit, static_argnames=("advantage", "mesh"))
@@ -258,9 +259,14 @@ def _compiled_values(
     policy: Policy,
     starts: Float[Array, "N S"],
     baseline: Baseline,
+    key: Key[Array, ""] | None,
 ) -> Float[Array, "K"]:
     def values(
-        simulator: Simulator, policy: Policy, starts: Float[Array, "N S"], baseline: Baseline
+        simulator: Simulator,
+        policy: Policy,
+        starts: Float[Array, "N S"],
+        baseline: Baseline,
+        key: Key[Array, ""] | None,
     ) -> Float[Array, "K"]:
         seen = partial(normalised, simulator.inputs)
 
@@ -273,7 +279,10 @@ def _compiled_values(
             return VALUE_FUNCTIONS[advantage.baseline].at_cut(baseline, flat).reshape(states.shape[:-1])
 
         # Whole episodes are judged by what they earn, undiscounted; cut ones by what the updates improve.
-        cut = (advantage.discount, after) if simulator.cut and advantage is not None else ()
-        return jax.lax.pmean(returns_per_model(simulator, act, starts, *cut), devices.AXIS)
+        discount, what_follows = (advantage.discount, after) if simulator.cut and advantage is not None else (1.0, None)
+        returns = returns_per_model(simulator, act, starts, discount, what_follows, key)
+        return jax.lax.pmean(returns, devices.AXIS)
 
-    return devices.spread(values, mesh, (WHOLE, WHOLE, FIRST, WHOLE), WHOLE)(simulator, policy, starts, baseline)
+    spread = devices.spread(values, mesh, (WHOLE, WHOLE, FIRST, WHOLE, WHOLE), WHOLE)
+    of_models: Float[Array, "K"] = spread(simulator, policy, starts, baseline, key)
+    return of_models

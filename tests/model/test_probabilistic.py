@@ -14,6 +14,7 @@ from metrpo.config import FitConfig
 from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Ensemble, mean_and_spread, predict, predict_delta
 from metrpo.model.fit import fit
+from metrpo.model.imagine import Simulator, returns_per_model
 from metrpo.model.sampling import SAMPLINGS, Keys
 from metrpo.types import Transitions
 
@@ -75,7 +76,7 @@ def test_with_a_key_it_draws_around_the_mean(fitted):
 def test_what_takes_one_models_word_draws_with_its_spread_anew_in_each_step(fitted, sampling):
     states, actions = np.full((4000, 2), 0.5, np.float32), np.zeros((4000, 1), np.float32)
     draw = SAMPLINGS[sampling].draw
-    now, then = (draw(fitted, states, actions, Keys(jax.random.key(i), KEY)) for i in (1, 2))
+    now, then = (draw(fitted, states, actions, Keys(KEY, KEY, jax.random.key(i))) for i in (1, 2))
     for drawn in (now, then):
         np.testing.assert_allclose(np.std(drawn, axis=0), noise_of(0.5), rtol=0.3)
     assert abs(np.corrcoef(now[:, 0], then[:, 0])[0, 1]) < 0.2
@@ -84,7 +85,7 @@ def test_what_takes_one_models_word_draws_with_its_spread_anew_in_each_step(fitt
 @pytest.mark.parametrize("sampling", ["model_mean", "model_med"])
 def test_what_asks_all_models_takes_their_means(fitted, sampling):
     states, actions = np.full((10, 2), 0.5, np.float32), np.zeros((10, 1), np.float32)
-    drawn = SAMPLINGS[sampling].draw(fitted, states, actions, Keys(KEY, KEY))
+    drawn = SAMPLINGS[sampling].draw(fitted, states, actions, Keys(KEY, KEY, KEY))
     assert np.ptp(drawn, axis=0).max() < 1e-6
 
 
@@ -111,6 +112,22 @@ def test_the_mean_learns_what_it_would_learn_without_a_spread():
         np.testing.assert_allclose(ours.networks[0][0], theirs.networks[0][0], atol=1e-4)
         np.testing.assert_allclose(ours.networks[-1][0][..., :2], theirs.networks[-1][0], atol=1e-4)
         assert not np.allclose(ours.networks[-1][0][..., 2:], weights[..., 2:], atol=1e-2), "the spread learned"
+
+
+def test_a_return_is_of_noisy_episodes_where_there_is_a_key(fitted):
+    simulator = Simulator(fitted, lambda states, actions, following: following[..., 0], None, 1)
+    starts = np.full((4000, 2), 0.5, np.float32)
+
+    def returns(key):
+        return np.asarray(
+            returns_per_model(simulator, lambda states: jnp.zeros((*states.shape[:2], 1)), starts, key=key)
+        )
+
+    means, noisy = returns(None), [returns(jax.random.key(i)) for i in range(2)]
+    np.testing.assert_array_equal(means, returns(None))
+    for one in noisy:
+        assert not np.array_equal(one, means)
+        np.testing.assert_allclose(one, means, atol=5 * noise_of(0.5) / np.sqrt(4000))
 
 
 def test_others_have_no_spread_and_no_noise():

@@ -131,11 +131,11 @@ def imagine(
 
     def step(carry: _Going, key: Key[Array, ""]) -> tuple[_Going, Trajectories]:
         states, alive, diverged, trusted, before = carry
-        action_key, model_key = jax.random.split(key)
+        action_key, model_key, noise_key = jax.random.split(key, 3)
         acted = act(states, action_key)
         actions, noted = acted if isinstance(acted, tuple) else (acted, None)
         clipped = simulator.limits.within(actions, before)
-        predicted = sampling.draw(models, states, clipped, Keys(model_key, episode_key))
+        predicted = sampling.draw(models, states, clipped, Keys(model_key, episode_key, noise_key))
         if simulator.bounds is not None:
             predicted = bounded(simulator.bounds, states, predicted)
         following, rewards, ended = outcome(simulator.reward, simulator.terminated, states, clipped, predicted)
@@ -186,19 +186,21 @@ def returns_per_model(
     starts: Float[Array, "N S"],
     discount: Number = 1.0,
     after: Callable[[Float[Array, "K N S"]], Float[Array, "K N"]] | None = None,
+    key: Key[Array, ""] | None = None,
 ) -> Float[Array, "K"]:
     """Mean return of the deterministic policy `act` from `starts`, in each model alone.
 
-    What follows the last step is worth `after` of its state; without `after`, nothing.
+    What follows the last step is worth `after` of its state; without `after`, nothing. Probabilistic members predict
+    with noise where there is a `key`.
 
     NaN for a model in which any rollout diverged: such a model cannot vouch for the policy.
     """
     ensemble, horizon, bonus = simulator.ensemble, simulator.horizon, simulator.disagreement
 
-    def step(carry: _Valued, weight: Float[Array, ""]) -> tuple[_Valued, None]:
-        states, alive, total, before = carry
+    def step(carry: _Valued, at: tuple[Float[Array, ""], Key[Array, ""] | None]) -> tuple[_Valued, None]:
+        (states, alive, total, before), (weight, noise_key) = carry, at
         actions = simulator.limits.within(act(states), before)
-        predicted = predict(ensemble, states, actions)
+        predicted = predict(ensemble, states, actions, noise_key)
         if simulator.bounds is not None:
             predicted = bounded(simulator.bounds, states, predicted)
         following, rewards, ended = outcome(simulator.reward, simulator.terminated, states, actions, predicted)
@@ -216,7 +218,8 @@ def returns_per_model(
     zeros = jnp.zeros(states.shape[:2])
     weights = jnp.float32(discount) ** jnp.arange(horizon)
     carry = (states, zeros + 1.0, zeros, simulator.nothing_before(*zeros.shape))
-    (states, alive, total, _), _ = jax.lax.scan(step, carry, weights)
+    keys = None if key is None else jax.random.split(share_of(key), horizon)
+    (states, alive, total, _), _ = jax.lax.scan(step, carry, (weights, keys))
     if after is not None:
         total = total + jnp.where(alive > 0, discount**horizon * after(states), 0.0)
     return jnp.mean(total, axis=1)

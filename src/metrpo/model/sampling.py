@@ -14,9 +14,6 @@ from jaxtyping import Float, Int, Key
 from metrpo.model.ensemble import Predictor, predict, predict_changing, with_carried
 from metrpo.types import Array
 
-_NOISE = 2**31 - 6
-"""Derives the keys of probabilistic members' noise."""
-
 
 def model_choice(
     key: Key[Array, ""], count: int, members: int
@@ -43,6 +40,8 @@ class Keys(NamedTuple):
     """Another one in every step."""
     episode: Key[Array, ""]
     """The same in all steps of a batch of episodes."""
+    noise: Key[Array, ""] | None = None
+    """Of what probabilistic members predict, another one in every step; None: their means."""
 
 
 @runtime_checkable
@@ -59,14 +58,14 @@ def step_rand(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
 ) -> Float[Array, "N P"]:
     """One model drawn at random for each state and step (paper, section 5)."""
-    return _of_drawn_models(ensemble, states, actions, keys.step, keys.step)
+    return _of_drawn_models(ensemble, states, actions, keys.step, keys.noise)
 
 
 def eps_rand(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
 ) -> Float[Array, "N P"]:
     """One model drawn at random for each episode."""
-    return _of_drawn_models(ensemble, states, actions, keys.episode, keys.step)
+    return _of_drawn_models(ensemble, states, actions, keys.episode, keys.noise)
 
 
 def _of_drawn_models(
@@ -74,12 +73,12 @@ def _of_drawn_models(
     states: Float[Array, "N S"],
     actions: Float[Array, "N A"],
     choice: Key[Array, ""],
-    step: Key[Array, ""],
+    noise: Key[Array, ""] | None,
 ) -> Float[Array, "N P"]:
     slots, _ = model_choice(choice, states.shape[0], ensemble.members)
     # The blanks repeat the last state; their predictions are dropped.
     states_of_each, actions_of_each = (jnp.take(x, slots, axis=0, mode="clip") for x in (states, actions))
-    grouped = predict(ensemble, states_of_each, actions_of_each, jax.random.fold_in(step, _NOISE))
+    grouped = predict(ensemble, states_of_each, actions_of_each, noise)
     return jnp.zeros((states.shape[0], grouped.shape[-1])).at[slots].set(grouped, mode="drop")
 
 
@@ -87,7 +86,7 @@ def one_model(
     ensemble: Predictor, states: Float[Array, "N S"], actions: Float[Array, "N A"], keys: Keys
 ) -> Float[Array, "N P"]:
     """The first model, always."""
-    return predict(ensemble.first(), states[None], actions[None], jax.random.fold_in(keys.step, _NOISE))[0]
+    return predict(ensemble.first(), states[None], actions[None], keys.noise)[0]
 
 
 def model_mean(

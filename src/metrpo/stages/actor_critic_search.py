@@ -44,6 +44,8 @@ _LOOKED_AT = 1000
 _COMPARED, _MOST = 1000, 0.95
 """Held-out steps, and the share of them, that decide how far models are trusted."""
 _disagreement = jax.jit(disagreement)
+_JUDGE = 2**31 - 6
+"""Derives the key of the noise in which policies are valued."""
 _NEAR = 0.99
 """Mean actions of a squashed policy beyond this saturate."""
 
@@ -114,7 +116,7 @@ def improve_policy(
     seen = dataset.train.states[-_LOOKED_AT:]
     policies = [squashed.mean_policy(x.actor, inputs, seen) for x in (before, learner)]
     with clock("validate"):
-        values = _values(config, simulator, policies, dataset.starts)
+        values = _values(config, simulator, policies, dataset.starts, jax.random.fold_in(key, _JUDGE))
     shown = normalised(inputs, seen)
     info = PhaseInfo(
         values=values[1],
@@ -165,12 +167,15 @@ def _trusted(config: Config, ensemble: Ensemble, dataset: Dataset, rng: np.rando
     return jnp.float32(config.actor_critic.trust * np.quantile(real, _MOST))
 
 
-def _values(config: Config, simulator: Simulator, policies: list[Policy], starts: np.ndarray) -> list[np.ndarray]:
-    """[K] for each of the `policies` of raw states: its mean return in every model, over whole episodes."""
+def _values(
+    config: Config, simulator: Simulator, policies: list[Policy], starts: np.ndarray, key: Array
+) -> list[np.ndarray]:
+    """[K] for each of the `policies` of raw states: its mean return in every model, over whole episodes, with noise."""
     rng = np.random.default_rng(0)  # the same starts for both; nothing is learned from these
     chosen = starts[rng.integers(len(starts), size=config.validate.starts)]
     plain = dataclasses.replace(simulator, inputs=None)
-    return [values_of(plain, policy, chosen) for policy in policies]
+    keys = jax.random.split(key, len(policies))
+    return [values_of(plain, policy, chosen, key=k) for policy, k in zip(policies, keys, strict=True)]
 
 
 def _columns(updates: UpdateInfo, learner: Learner, policy: Policy, states: np.ndarray) -> dict[str, float]:
