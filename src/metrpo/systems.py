@@ -34,8 +34,6 @@ ACTOR_CRITIC: Overrides = {
     "ensemble.probabilistic": True,
     "evaluation_episodes": 5,
     "fit.max_steps": 1000,
-    "fit.decay": True,
-    "fit.weight_decay": 0.1,
     "imagine.start": "anywhere",
     "iterations": 50,
     "policy.hidden": (256, 256),

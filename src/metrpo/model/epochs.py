@@ -99,36 +99,6 @@ def validation_loss(ensemble: Ensemble, validation: Transitions, loss_units: str
     return jax.lax.fori_loop(0, chunks, chunk_sum, jnp.zeros(members)) / validation.size
 
 
-@jax.jit
-def calibrated(ensemble: Ensemble, validation: Transitions) -> Ensemble:
-    """Probabilistic members with spreads as wide, in every dimension, as their errors on validation data (others: as
-    they are). Errors on training data, which the fit has seen, are smaller.
-
-    Kuleshov et al. 2018 calibrate so; here the law stays normal and its width alone changes.
-    """
-    *inner, (weights, biases) = ensemble.networks
-    size, members = ensemble.normaliser.delta_std.shape[-1], ensemble.members
-    if biases.shape[-1] == size:
-        return ensemble
-    capacity = validation.states.shape[0]
-
-    def chunk_sum(i: Int[Array, ""], total: Float[Array, "K D"]) -> Float[Array, "K D"]:
-        index = i * VALIDATION_CHUNK + jnp.arange(VALIDATION_CHUNK)
-        rows = (jnp.take(x, index, axis=0, mode="clip") for x in validation[:3])
-        states, actions, deltas = (jnp.broadcast_to(x, (members, *x.shape)) for x in rows)
-        n, (means, log_spread) = ensemble.normaliser, mean_and_spread(ensemble, states, actions)
-        assert log_spread is not None
-        errors = ((n.delta_mean + n.delta_std * means - deltas) / n.delta_std) * jnp.exp(-log_spread)
-        counts = (index < jnp.minimum(validation.size, capacity))[:, None]
-        return total + jnp.sum(jnp.where(counts, jnp.square(errors), 0.0), axis=1)
-
-    chunks = (validation.size + VALIDATION_CHUNK - 1) // VALIDATION_CHUNK
-    squares = jax.lax.fori_loop(0, chunks, chunk_sum, jnp.zeros((members, size))) / validation.size
-    wider = 0.5 * jnp.log(jnp.maximum(squares, 1e-12))
-    sound = jnp.where(jnp.isfinite(wider), wider, 0.0)[:, None]
-    return ensemble._replace(networks=(*inner, (weights, biases.at[..., size:].add(sound))))
-
-
 @partial(jax.jit, static_argnames=("config", "mesh"), donate_argnums=0)
 def train_and_validate(
     at: FitState,

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int, Key, Shaped
 from metrpo import devices
 from metrpo.config import FitConfig
 from metrpo.model.ensemble import Ensemble, Networks
-from metrpo.model.epochs import FitData, FitState, calibrated, optimizer_of, train_and_validate, validation_loss
+from metrpo.model.epochs import FitData, FitState, optimizer_of, train_and_validate, validation_loss
 from metrpo.types import Array, Normaliser, Transitions
 
 
@@ -48,7 +48,7 @@ def fit(
     key: Key[Array, ""],
     on_validation: Callable[[int, Float[Array, "K"]], None] = lambda passes, losses: None,
 ) -> tuple[Ensemble, FitInfo]:
-    """The ensemble fitted to `train`, each member at its own best validation loss; spreads are calibrated there.
+    """The ensemble fitted to `train`, each member at its own best validation loss.
 
     Stops when no member has improved for `config.patience` passes, at the latest after `config.max_passes` or
     `config.max_steps`.
@@ -76,7 +76,7 @@ def fit(
     diverged = ~(_finite(at.networks) & np.isfinite(at.train_loss))
     lost = ~(_finite(at.best_networks) & np.isfinite(at.best_loss)) | (diverged & (np.asarray(at.best_pass) == 0))
     info = FitInfo(passes, at.best_loss, at.train_loss, at.best_pass, diverged, lost)
-    return calibrated(Ensemble(at.best_networks, data.normaliser), data.validation), info
+    return Ensemble(at.best_networks, data.normaliser), info
 
 
 def refit(
