@@ -13,13 +13,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from stored import newest_of
 
-from metrpo import State, config, init
+from metrpo import State
 from metrpo.config import Config
 from metrpo.policy import squashed
 from metrpo.policy.inputs import normalised
 from metrpo.policy.value import critics
-from metrpo.run.directory import RunDirectory
 from metrpo.seeds import Stage, rng_of
 from metrpo.stages.state import inputs_for
 from metrpo.types import Episode
@@ -34,11 +34,7 @@ def main() -> None:
     parser.add_argument("run_dir", type=Path)
     parser.add_argument("--episodes", type=int, default=4)
     given = parser.parse_args()
-    settings = config.from_json((given.run_dir / "config.json").read_text())
-    with RunDirectory(given.run_dir, settings) as run:
-        state = run.load(init(settings))
-    if state is None:
-        parser.error(f"{given.run_dir}: expected a run with a checkpoint, got none")
+    settings, state = newest_of(given.run_dir)
     for name, noise in (("with noise", 1.0), ("without", 0.0)):
         print(f"{name}: {judged(settings, state, played(settings, state, given.episodes, noise))}", flush=True)
 

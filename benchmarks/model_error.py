@@ -8,20 +8,18 @@ dimension: root mean square error of the prediction over that of predicting no c
 from __future__ import annotations
 
 import argparse
-import dataclasses
 from functools import partial
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from stored import newest_of
 
-from metrpo import config, init
 from metrpo.model import ensemble as ensembles
 from metrpo.policy import gaussian
-from metrpo.run.checkpoint import load_state
 from metrpo.types import Episode
-from metrpo.world.collection import collect
+from metrpo.world.collection import collect, explore
 from metrpo.world.registry import task_for
 
 
@@ -49,16 +47,13 @@ def main() -> None:
     parser.add_argument("run_dir", type=Path)
     parser.add_argument("--episodes", type=int, default=20)
     arguments = parser.parse_args()
-    settings = config.from_json((arguments.run_dir / "config.json").read_text())
-    task = task_for(settings)
-    newest = sorted((arguments.run_dir / "checkpoints").glob("*.npz"))[-1]
-    state, _ = load_state(newest, init(settings))
-    e = settings.ensemble
+    settings, state = newest_of(arguments.run_dir)
+    task, e = task_for(settings), settings.ensemble
     normaliser = ensembles.normaliser_of(state.dataset.train, e.std_floor, e.delta_std_floor, task.unseen)
     ensemble = ensembles.Ensemble(state.networks, normaliser, ensembles.Carried(task.carried))
     act = partial(gaussian.mean, jax.tree.map(np.asarray, state.policy))
-    noise = dataclasses.replace(settings.collect, steps=arguments.episodes * task.horizon)
-    episodes = collect(task, lambda _: act, noise, np.random.default_rng(2**40))
+    rng, steps = np.random.default_rng(2**40), arguments.episodes * task.horizon
+    episodes = collect(task, lambda rng: explore(act, settings.collect, rng), steps, rng)
     print(f"{task.name}, iteration {state.iteration}, {len(episodes)} fresh episodes; error relative to no change")
     for steps in (1, 10, 50):
         print(f"{steps:>3} steps  ", " ".join(f"{x:6.2f}" for x in relative_error(ensemble, episodes, steps)))

@@ -16,8 +16,9 @@ from pathlib import Path
 
 import jax
 import numpy as np
+from stored import newest_of
 
-from metrpo import State, config, init, policy_phase
+from metrpo import State, init, policy_phase
 from metrpo.config import Config
 from metrpo.console.progress import SILENT
 from metrpo.model import ensemble as ensembles
@@ -26,7 +27,6 @@ from metrpo.model.ensemble import Carried, Ensemble
 from metrpo.policy.value.value_table import init_baseline
 from metrpo.presets import override
 from metrpo.run.clock import Clock
-from metrpo.run.directory import RunDirectory
 from metrpo.seeds import Stage, key_of
 from metrpo.stages import policy_search, records
 from metrpo.world.registry import task_for
@@ -41,11 +41,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--fresh", action="store_true")
     arguments = parser.parse_args()
-    settings = config.from_json((arguments.run_dir / "config.json").read_text())
-    with RunDirectory(arguments.run_dir, settings) as run:
-        state = run.load(init(settings))
-    if state is None:
-        parser.error(f"{arguments.run_dir}: expected a run with a checkpoint, got none")
+    settings, state = newest_of(arguments.run_dir)
     for variant in arguments.variants:
         values = {} if variant == "as-run" else dict(pair.split("=") for pair in variant.split(","))
         now = override(settings, {name: json.loads(value) for name, value in values.items()})

@@ -24,7 +24,7 @@ from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import ConfigError
 from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Carried, Ensemble, Networks, predict
-from metrpo.model.epochs import loss_of, minibatch
+from metrpo.model.epochs import losses_of, minibatch
 from metrpo.policy import gaussian
 from metrpo.policy.advantage import discounted_returns
 from metrpo.policy.gaussian import Policy
@@ -237,7 +237,7 @@ def _train_model(
     optimizer = optax.adam(config.learning_rate)
 
     def loss(networks: Networks, *batch: Array) -> Array:
-        return jnp.mean(loss_of(Ensemble(networks, normaliser), config.loss_units, *batch))
+        return jnp.mean(losses_of(Ensemble(networks, normaliser), config.loss_units, *batch)[0])
 
     def step(carry: tuple[Networks, Any], key: Array) -> tuple[tuple[Networks, Any], Array]:
         networks, moments = carry

@@ -48,29 +48,17 @@ class FitState(NamedTuple):
     train_loss: Float[Array, "K"]
 
 
-def loss_of(
-    ensemble: Ensemble,
-    loss_units: str,
-    states: Float[Array, "K B S"],
-    actions: Float[Array, "K B A"],
-    deltas: Float[Array, "K B D"],
-) -> Float[Array, "K B"]:
-    """Squared error of the predicted change, summed over state dimensions (paper, eq. 1).
-
-    In "raw" state units (the paper), or each dimension in units of its "std", so that none drowns another.
-    """
-    return _losses(ensemble, loss_units, states, actions, deltas)[0]
-
-
-def _losses(
+def losses_of(
     ensemble: Ensemble,
     loss_units: str,
     states: Float[Array, "K B S"],
     actions: Float[Array, "K B A"],
     deltas: Float[Array, "K B D"],
 ) -> tuple[Float[Array, "K B"], Float[Array, "K B"] | float]:
-    """`loss_of`, and how unlikely probabilistic members hold the errors that they make, in nats (others: 0).
+    """Squared error of the predicted change, summed over state dimensions (paper, eq. 1), and how unlikely
+    probabilistic members hold the errors that they make, in nats (others: 0).
 
+    Errors are in "raw" state units (the paper), or each dimension's in units of its "std", so that none drowns another.
     The likelihood's gradient is of the spread alone: the mean learns what it would learn without.
     """
     n, (means, log_spread) = ensemble.normaliser, mean_and_spread(ensemble, states, actions)
@@ -85,14 +73,14 @@ def _losses(
 
 @partial(jax.jit, static_argnames="loss_units")
 def validation_loss(ensemble: Ensemble, validation: Transitions, loss_units: str = "raw") -> Float[Array, "K"]:
-    """Mean of `loss_of` over the first `size` validation transitions; the capacity beyond costs nothing."""
+    """Mean squared error over the first `size` validation transitions (`losses_of`); capacity beyond costs nothing."""
     members = ensemble.members
     capacity = validation.states.shape[0]
 
     def chunk_sum(i: Int[Array, ""], total: Float[Array, "K"]) -> Float[Array, "K"]:
         index = i * VALIDATION_CHUNK + jnp.arange(VALIDATION_CHUNK)
         rows = [jnp.take(x, index, axis=0, mode="clip") for x in validation[:3]]
-        losses = loss_of(ensemble, loss_units, *(jnp.broadcast_to(x, (members, *x.shape)) for x in rows))
+        losses, _ = losses_of(ensemble, loss_units, *(jnp.broadcast_to(x, (members, *x.shape)) for x in rows))
         return total + jnp.sum(jnp.where(index < jnp.minimum(validation.size, capacity), losses, 0.0), axis=-1)
 
     chunks = (validation.size + VALIDATION_CHUNK - 1) // VALIDATION_CHUNK
@@ -133,7 +121,7 @@ def _block(
 
     def total_loss(networks: Networks, *batch: Float[Array, "K B _"]) -> tuple[Float[Array, ""], Float[Array, "K"]]:
         ensemble = Ensemble(with_products(networks, config.products), normaliser)
-        losses, surprise = _losses(ensemble, config.loss_units, *batch)
+        losses, surprise = losses_of(ensemble, config.loss_units, *batch)
         return jnp.sum(jnp.mean(losses + surprise, axis=-1)), jnp.mean(losses, axis=-1)
 
     def train_group(group: _Training, numbers: Int[Array, "K"], key: Key[Array, ""]) -> _Training:
