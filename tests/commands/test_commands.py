@@ -327,7 +327,7 @@ def test_no_video_costs_the_video_only(capsys, monkeypatch):
 
     monkeypatch.setattr("metrpo.evaluation.record", broken)
     assert run("train", "Swimmer", "--iterations", "1", "--run-dir", "a") == 0
-    assert "video    none: no video encoder: install it" in capsys.readouterr().out
+    assert "video    none: no video encoder: install it; --no-video makes none" in capsys.readouterr().out
     assert run("render", "a") == 2
     assert capsys.readouterr().err == "metrpo: no video encoder: install it\n"
 

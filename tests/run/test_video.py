@@ -107,7 +107,7 @@ def test_other_failures_are_not_blamed_on_opengl(tmp_path, monkeypatch):
         record(Pictures, zero, tmp_path / "v.gif")
     assert "osmesa" not in str(error.value)
     monkeypatch.setattr(Pictures, "render", gymnasium.Env.render)
-    with pytest.raises(VideoError, match=r"has no render\(\), so there is nothing to see; skip the video: --no-video"):
+    with pytest.raises(VideoError, match=r"has no render\(\), so there is nothing to see$"):
         record(Pictures, zero, tmp_path / "v.gif")
 
 
@@ -130,12 +130,10 @@ def test_with_pygame_the_pendulum_is_seen(tmp_path):
 
 
 def test_an_environment_without_pictures_is_named(tmp_path, monkeypatch):
-    with pytest.raises(
-        VideoError, match=r"cannot create the environment with render_mode.*TypeError.*take render_mode.*--no-video"
-    ):
+    with pytest.raises(VideoError, match=r"cannot create the environment with render_mode.*TypeError.*take render_mode$"):
         record(lambda: None, zero, tmp_path / "v.gif")
     monkeypatch.setattr(Pictures, "render", lambda self: None)
-    with pytest.raises(VideoError, match=r"expected a picture \[height, width, 3\], got NoneType.*--no-video"):
+    with pytest.raises(VideoError, match=r"expected a picture \[height, width, 3\], got NoneType.*rgb_array\"$"):
         record(Pictures, zero, tmp_path / "v.gif")
 
 

@@ -88,7 +88,8 @@ def say_outcome(run_dir: Path, video: bool) -> None:
     try:
         print(_video_of(run_dir) or render(run_dir))
     except Exception as error:  # the run is complete without it
-        print(f"none: {error}" if isinstance(error, VideoError) else f"none ({type(error).__name__}: {error})")
+        said = f": {error}" if isinstance(error, VideoError) else f" ({type(error).__name__}: {error})"
+        print(f"none{said}; --no-video makes none")
 
 
 def _video_of(run_dir: Path) -> Path | None:

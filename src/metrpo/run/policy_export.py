@@ -292,7 +292,7 @@ Its limits: $limits
 $history
 Written by metrpo $metrpo from a policy.npz with SHA-256
 $policy_sha256,
-trained for $iteration iterations on $real_steps real steps. Run this file to check it.
+as iteration $iteration left it, after $real_steps real steps. Run this file to check it.
 """
 
 import base64

@@ -143,7 +143,7 @@ def _frame(env: Any) -> np.ndarray:
     if np.ndim(picture) != 3:
         raise VideoError(
             f"render: expected a picture [height, width, 3], got {type(picture).__name__}: let the environment return "
-            'one where render_mode is "rgb_array", or skip the video: --no-video'
+            'one where render_mode is "rgb_array"'
         )
     height, width = picture.shape[0] // 2 * 2, picture.shape[1] // 2 * 2  # what yuv420p can hold
     return np.ascontiguousarray(picture[:height, :width])
@@ -160,11 +160,11 @@ def _blame(error: Exception, what: str) -> VideoError:
         return VideoError(f"cannot render here ({said}): {INSTALL_GL}; see: metrpo doctor")
     if isinstance(cause, gymnasium.error.DependencyNotInstalled | ImportError):
         install = INSTALL_EXTRA if "pygame" in str(cause) else "install it"
-        return VideoError(f"{what}: a package is missing ({said}): {install}, or skip the video: --no-video")
+        return VideoError(f"{what}: a package is missing ({said}): {install}")
     if isinstance(cause, NotImplementedError):
-        return VideoError("the environment has no render(), so there is nothing to see; skip the video: --no-video")
+        return VideoError("the environment has no render(), so there is nothing to see")
     advice = "let its constructor take render_mode" if isinstance(cause, TypeError) else "repair the environment"
-    return VideoError(f"{what} ({said}): {advice}, or skip the video: --no-video")
+    return VideoError(f"{what} ({said}): {advice}")
 
 
 def _comes_from_gl(error: BaseException) -> bool:
