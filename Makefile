@@ -4,7 +4,7 @@
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup baselines ray train test test-slow docs package lock clean
+.PHONY: help setup baselines ray trackers train test test-slow docs package lock clean
 
 PYTHON ?=
 RUN_DIR ?=
@@ -53,6 +53,9 @@ baselines: $(READY)  ## add what the systems ppo and ddpg need (PyTorch, Stable-
 
 ray: $(READY)  ## add what `--backend ray` needs, and the slow test of it
 	$(BIN)/python -m pip install --disable-pip-version-check 'ray>=2.49'
+
+trackers: $(READY)  ## add what `--track` needs, and the tests of it
+	$(BIN)/python -m pip install --disable-pip-version-check -e '.[wandb,mlflow,trackio]'
 
 lock:  ## take the newest versions into the two lock files (needs uv; no other target does)
 	$(UV) pip compile --quiet --upgrade --universal --python-version 3.11 --fork-strategy requires-python \
