@@ -92,6 +92,10 @@ def test_the_file_itself_can_be_loaded(loaded, tmp_path):
     np.testing.assert_array_equal(load_policy(tmp_path / "policy.npz")(np.ones(S)), loaded(np.ones(S)))
 
 
+def test_its_repr_is_a_line_without_weights(loaded):
+    assert repr(loaded) == f"LoadedPolicy(info={loaded.info!r})"
+
+
 def test_no_policy_says_how_to_get_one(tmp_path):
     with pytest.raises(
         RunDirectoryError, match=r"holds no policy: expected .*policy\.npz; train one with: metrpo train"

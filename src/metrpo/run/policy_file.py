@@ -113,9 +113,9 @@ class LoadedPolicy:
     """
 
     info: PolicyInfo
-    layers: tuple[tuple[np.ndarray, np.ndarray], ...]
+    layers: tuple[tuple[np.ndarray, np.ndarray], ...] = field(repr=False)
     """Weights [in, out] and bias [out] of every layer."""
-    origin: np.ndarray | None = None
+    origin: np.ndarray | None = field(default=None, repr=False)
     """[S], float64: what its states are counted from, where that is not 0."""
     _last: dict[str, np.ndarray] = field(default_factory=dict, compare=False, repr=False)
     """The last `action`, where the next one depends on it; the last `state`, where that holds a history; and the action
