@@ -46,6 +46,13 @@ def folder(tmp_path):
     return tmp_path / "runs"
 
 
+def test_runs_of_one_seed_are_not_taken_for_seeds(folder):
+    a_run(folder / "again" / "seed-2", Config("Swimmer", system="me-trpo", seed=2), rows([0.0, 1.0]))
+    own, other = (one for one in compare(find([folder]).runs) if one.task == "Swimmer")
+    assert (own.seeds, own.caveat) == (4, "Swimmer, me-trpo: several runs of seed 2, which are not independent.")
+    assert other.caveat == ""
+
+
 def test_numbers_are_those_worked_out_by_hand(folder):
     hopper, ours, theirs = sorted(compare(find([folder]).runs, 15.0), key=lambda one: (one.task, one.label))
     assert (ours.seeds, ours.last.value, ours.best, ours.real_steps) == (3, 24.0, 30.0, (300, 300))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -51,7 +52,7 @@ class Compared:
     against: str
     """The reference."""
     caveat: str
-    """What to think of the intervals; empty where there are seeds enough."""
+    """What to think of the intervals; empty where there are seeds enough, each once."""
 
     def plain(self) -> dict[str, Any]:
         """As JSON has it."""
@@ -106,8 +107,17 @@ def _compared(own: Group, reference: Group, level: float) -> Compared:
         reached=len(reached),
         better=better,
         against=reference.label,
-        caveat=caveat(last) if better is None else caveat(last, _last(reference)),
+        caveat=" ".join(filter(None, [caveat(last, *([] if better is None else [_last(reference)])), _repeats(own)])),
     )
+
+
+def _repeats(group: Group) -> str:
+    """A sentence where runs of one seed stand as several seeds; else empty."""
+    times = Counter(run.config.seed for run in group.runs)
+    seeds = [str(seed) for seed, count in times.items() if count > 1]
+    if not seeds:
+        return ""
+    return f"{group.task}, {group.label}: several runs of seed {', '.join(seeds)}, which are not independent."
 
 
 def _interval(statistic: Any, *scores: np.ndarray) -> Interval:

@@ -130,7 +130,7 @@ def test_with_pygame_the_pendulum_is_seen(tmp_path):
 
 
 def test_an_environment_without_pictures_is_named(tmp_path, monkeypatch):
-    with pytest.raises(VideoError, match=r"cannot create the environment with render_mode.*TypeError.*take render_mode$"):
+    with pytest.raises(VideoError, match=r"cannot create the environment with render_mode.*TypeError.*render_mode$"):
         record(lambda: None, zero, tmp_path / "v.gif")
     monkeypatch.setattr(Pictures, "render", lambda self: None)
     with pytest.raises(VideoError, match=r"expected a picture \[height, width, 3\], got NoneType.*rgb_array\"$"):
