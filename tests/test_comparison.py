@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from metrpo.commands import main
 from metrpo.comparison import compare
-from metrpo.config import Config
+from metrpo.config import Config, EnsembleConfig
 from metrpo.errors import ConfigError
 from metrpo.plots.bands import curve
 from metrpo.plots.learning_curves import Look, plot
@@ -144,6 +144,19 @@ def test_a_picture_looks_as_asked(folder, tmp_path, monkeypatch):
     plot(find([folder]).runs, tmp_path / "b.png", look=Look(legend="none"))
     assert [a.get_legend() for a in seen[1].axes] == [None] * 2
     assert seen[1].axes[0].get_xscale() == "linear"
+
+
+def test_legends_side_by_side_do_not_meet(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: seen.append(self) or file.write(b"x"))
+    for task in ("Swimmer", "Hopper", "Ant"):
+        for members in (1, 2, 3):
+            config = Config(task, ensemble=EnsembleConfig(members=members, probabilistic=members > 1))
+            a_run(tmp_path / task / f"{members}" / "seed-0", config, rows([1.0, 2.0]))
+    plot(find([tmp_path]).runs, tmp_path / "b.png")
+    widths = [axes.get_legend().get_window_extent().width for axes in seen[0].axes]
+    assert len(widths) == 3
+    assert max(widths) <= seen[0].bbox.width / 3
 
 
 def test_looks_that_cannot_be_are_refused():

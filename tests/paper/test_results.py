@@ -99,3 +99,17 @@ def test_of_every_mutant_that_survived_it_is_said_why():
         for row in rows:
             known = (module, row["before"], row["after"]) in explained
             assert row["outcome"] in ("killed", "timeout") or known, f"{module}, line {row['line']}: {row['after']}"
+
+
+@pytest.mark.parametrize("task", ["delayed.py-cart", "delayed.py-cheetah", "half_seen.py-pendulum"])
+def test_the_docs_say_what_a_history_is_worth(task):
+    page = (ROOT / "docs" / "environments.md").read_text()
+    means = []
+    for history, bold in ((1, ""), (3, "**")):
+        seeds = (ROOT / "results" / "history" / f"examples-{task}" / f"me-trpo,history={history}").glob("seed-*")
+        last = [read_metrics(seed / "metrics.csv")[-1] for seed in sorted(seeds)]
+        returns = [row["return_real"] for row in last]
+        assert ([row["real_steps"] for row in last]) == [10_000] * 3
+        means.append(sum(returns) / 3)
+        assert f"| {history} | {bold}{means[-1]:.1f}{bold} | {min(returns):.1f} |" in page
+    assert means[1] > means[0]

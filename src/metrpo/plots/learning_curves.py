@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,8 @@ Legend = Literal["below", "inside", "none"]
 FORMATS = ("png", "svg", "pdf")
 _DOTS = 25
 """Most points of a line that are marked each."""
+_LETTERS = 48
+"""In a line of a legend: as many as a panel is wide."""
 
 _NAMES = {
     "real_steps": "real steps",
@@ -111,7 +114,8 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
                 axes.fill_between(c.x, c.low, c.high, color=style["color"], alpha=0.15, linewidth=0)
             name = f"{g.label} ({counted(len(c.seeds), 'seed')})" if len(c.seeds) > 1 else g.label
             marker = "o" if len(c.seeds) == 1 and len(c.x) <= _DOTS else ""
-            axes.plot(c.x, c.mean, **style, linewidth=2, marker=marker, markersize=3.5, label=name)
+            label = textwrap.fill(name, _LETTERS, break_on_hyphens=False)
+            axes.plot(c.x, c.mean, **style, linewidth=2, marker=marker, markersize=3.5, label=label)
         axes.set_title(task, fontsize=11, parse_math=False)
         axes.set_xlabel(look.x_label or _NAMES.get(x, x), parse_math=False)
         axes.set_ylabel(look.y_label or _NAMES.get(y, y), parse_math=False)
@@ -128,7 +132,7 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
             axes.set_xlim(*look.x_limits)
         if look.y_limits is not None:
             axes.set_ylim(*look.y_limits)
-        _add_legend(axes, look.legend)
+        _add_legend(axes, look.legend, figure.bbox.width / columns)
     if look.title is not None:
         figure.suptitle(look.title, fontsize=13, parse_math=False)
     for axes in panels[len(tasks) :]:
@@ -142,14 +146,18 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
     return path
 
 
-def _add_legend(axes: Axes, where: Legend) -> None:
+def _add_legend(axes: Axes, where: Legend, room: float) -> None:
+    """`room` is the width in pixels that a panel has: a legend below it has as many columns as fit."""
     if where == "none":
         return
-    place: dict[str, Any] = {"loc": "best"}
-    if where == "below":
-        place = {"ncols": 3, "loc": "upper center", "bbox_to_anchor": (0.5, -0.14)}
-    for text in axes.legend(frameon=False, fontsize=8, handlelength=3, **place).get_texts():
-        text.set_parse_math(False)
+    below: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.14)}
+    for columns in (3, 2, 1) if where == "below" else (1,):
+        place = below | {"ncols": columns} if where == "below" else {"loc": "best"}
+        legend = axes.legend(frameon=False, fontsize=8, handlelength=3, **place)
+        for text in legend.get_texts():
+            text.set_parse_math(False)
+        if legend.get_window_extent().width <= room:
+            return
 
 
 def _logarithmic(axes: Axes) -> None:
