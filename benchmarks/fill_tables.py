@@ -1,7 +1,8 @@
 """Puts the tables of results into the pages: `python benchmarks/fill_tables.py`, after `metrpo reproduce`.
 
-Between `<!-- NAME -->` and `<!-- end -->` of docs/reproduction.md goes `results/laptop/figures/NAME.md`; elsewhere the
-page's table of runs is replaced by what `summarise.py` makes of the folders in `PAGES`, and that of MBBL's tasks.
+Between `<!-- NAME -->` and `<!-- end -->` of docs/reproduction.md goes `results/laptop/figures/NAME.md`. Elsewhere
+the table under `<!-- runs: PATTERN ... -->` is what `summarise.py` makes of these folders of results/; that of MBBL's
+tasks and the README's are made anew too.
 """
 
 from __future__ import annotations
@@ -10,16 +11,12 @@ import re
 
 import headline
 import mbbl_table
-from summarise import HEADER, ROOT, table
+from summarise import ROOT, table
 
 from metrpo.report.tables import markdown_row
 
 PAGE, FIGURES = ROOT.parent / "docs" / "reproduction.md", ROOT / "laptop" / "figures"
-PAGES = {
-    "docs/results.md": ["laptop/*/me-trpo"],
-    "docs/fast-preset.md": ["ensemble-size", "fast-after", "fast-before", "fast-choices"],
-    "docs/environments.md": ["own"],
-}
+PAGES = sorted((ROOT.parent / "docs").glob("*.md"))
 
 
 def with_figures(page: str) -> str:
@@ -31,11 +28,13 @@ def with_figures(page: str) -> str:
     return re.sub(r"(<!-- ([\w-]+) -->)\n.*?(<!-- end -->)", figure, page, flags=re.DOTALL)
 
 
-def with_runs(page: str, patterns: list[str]) -> str:
-    """The page with its one table of runs made anew."""
-    runs = table([path for pattern in patterns for path in ROOT.glob(pattern)])
-    head = re.escape(f"{markdown_row(HEADER)}\n")
-    return re.sub(rf"{head}(\|.*\n)+", lambda _: runs, page)
+def with_runs(page: str) -> str:
+    """The page with its tables of runs made anew."""
+
+    def runs(found: re.Match[str]) -> str:
+        return found[1] + table([path for pattern in found[2].split() for path in ROOT.glob(pattern)])
+
+    return re.sub(r"(<!-- runs: (.+) -->\n\n)(\|.*\n)+", runs, page)
 
 
 def with_mbbl(page: str) -> str:
@@ -53,6 +52,5 @@ if __name__ == "__main__":
     README = ROOT.parent / "README.md"
     README.write_text(with_headline(README.read_text()))
     PAGE.write_text(with_figures(PAGE.read_text()))
-    for name, patterns in PAGES.items():
-        path = ROOT.parent / name
-        path.write_text(with_mbbl(with_runs(path.read_text(), patterns)))
+    for path in PAGES:
+        path.write_text(with_mbbl(with_runs(path.read_text())))

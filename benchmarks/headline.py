@@ -1,6 +1,6 @@
 """The table of the README: returns beside what no skill earns and, where it was searched, the ceiling.
 
-`python benchmarks/fill_tables.py` puts it into the README, from results/EXPERIMENT, results/yardsticks.json
+`python benchmarks/fill_tables.py` puts it into the README, from results/fast or results/laptop, results/yardsticks.json
 (`yardsticks.py`) and results/ceilings (`ceiling.py`).
 """
 
@@ -14,9 +14,10 @@ from summarise import ROOT, no_skill
 from metrpo import read_metrics
 from metrpo.report.tables import markdown
 
-EXPERIMENT = "laptop"
+FOLDERS = ("fast", "laptop")
+"""Of results/: a task's row is of the first one that has runs of it, those of the preset as it is, or as it was."""
 TASKS = ("Swimmer", "Snake", "HalfCheetah", "Hopper", "HopperUpright", "Ant", "Humanoid", "HumanoidStandup")
-HEADER = ("task", "real steps", "seeds", "return", "worst seed", "doing nothing", "random actions", "ceiling")
+HEADER = ("task", "real steps", "seeds", "return", "worst seed", "doing nothing", "random actions", "ceiling", "runs")
 
 
 def table() -> str:
@@ -25,11 +26,11 @@ def table() -> str:
 
 
 def _row(task: str) -> tuple[str, ...] | None:
-    last = [
-        read_metrics(path)[-1] for path in sorted((ROOT / EXPERIMENT / task / "me-trpo").glob("seed-*/metrics.csv"))
-    ]
-    if not last:
+    found = {name: sorted((ROOT / name / task / "me-trpo").glob("seed-*/metrics.csv")) for name in FOLDERS}
+    folder = next((name for name in FOLDERS if found[name]), None)
+    if folder is None:
         return None
+    last = [read_metrics(path)[-1] for path in found[folder]]
     returns = [float(row["return_real"] or np.nan) for row in last]
     file = ROOT / "ceilings" / f"{task}.json"
     ceiling = f"{json.loads(file.read_text())['best']['mean']:.0f}" if file.exists() else "not searched"
@@ -41,4 +42,5 @@ def _row(task: str) -> tuple[str, ...] | None:
         f"{np.min(returns):.1f}",
         *no_skill(task),
         ceiling,
+        f"[{folder}](results/{folder}/{task})",
     )

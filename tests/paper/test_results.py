@@ -66,9 +66,10 @@ def test_a_result_is_whole(run):
 def test_the_tables_are_those_that_the_metrics_give(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     fill = runpy.run_path(str(ROOT / "benchmarks" / "fill_tables.py"))
-    for page, patterns in fill["PAGES"].items():
-        table = fill["table"]([path for pattern in patterns for path in (ROOT / "results").glob(pattern)])
-        assert table in (ROOT / page).read_text(), f"{page}: run: python benchmarks/fill_tables.py"
+    texts = {page: page.read_text() for page in fill["PAGES"]}
+    assert sum(text.count("<!-- runs: ") for text in texts.values()) >= 4
+    for page, text in texts.items():
+        assert fill["with_runs"](text) == text, f"{page}: run: python benchmarks/fill_tables.py"
     assert fill["headline"].table() in (ROOT / "README.md").read_text(), "run: python benchmarks/fill_tables.py"
     assert fill["mbbl_table"].table() in (ROOT / "docs" / "environments.md").read_text()
 
