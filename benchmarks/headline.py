@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 
 import numpy as np
-from summarise import ROOT, no_skill
+from summarise import ROOT, no_skill, real_steps
 
 from metrpo import read_metrics
 from metrpo.report.tables import markdown
@@ -36,7 +36,7 @@ def _row(task: str) -> tuple[str, ...] | None:
     ceiling = f"{json.loads(file.read_text())['best']['mean']:.0f}" if file.exists() else "not searched"
     return (
         task,
-        f"{min(int(row['real_steps'] or 0) for row in last):,}",
+        real_steps(last),
         str(len(last)),
         f"{np.mean(returns):.1f}",
         f"{np.min(returns):.1f}",

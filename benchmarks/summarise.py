@@ -16,6 +16,7 @@ import numpy as np
 
 from metrpo import read_metrics
 from metrpo.report.tables import markdown
+from metrpo.run.metrics import Row
 
 ROOT = Path(__file__).resolve().parents[1] / "results"
 HEADER = (
@@ -46,7 +47,7 @@ def row(system: Path) -> tuple[str, ...]:
         system.parent.name,
         system.name,
         str(len(runs)),
-        f"{min(run[-1]['real_steps'] for run in runs):,}",
+        real_steps([run[-1] for run in runs]),
         over_seeds(last),
         over_seeds([float(np.min(last))]),
         *no_skill(json.loads(next(system.glob("seed-*/config.json")).read_text())["task"]),
@@ -54,6 +55,12 @@ def row(system: Path) -> tuple[str, ...]:
         over_seeds([_value(run[-1], "gap") for run in runs]),
         over_seeds([_value(run[-1], "wall_seconds") / 60 for run in runs]),
     )
+
+
+def real_steps(last: list[Row]) -> str:
+    """The real steps of runs with these last rows: one number, or the fewest and the most."""
+    few, most = (int(pick(row["real_steps"] or 0 for row in last)) for pick in (min, max))
+    return f"{few:,}" if few == most else f"{few:,} to {most:,}"
 
 
 def no_skill(task: str) -> tuple[str, str]:

@@ -15,6 +15,7 @@ from metrpo.config import Config, EnsembleConfig
 from metrpo.errors import ConfigError
 from metrpo.plots.bands import curve
 from metrpo.plots.learning_curves import Look, plot
+from metrpo.report.tables import markdown_row, written
 from metrpo.run.find import find, group
 from seen_runs import Page, a_run
 
@@ -44,6 +45,11 @@ def folder(tmp_path):
     a_run(tmp_path / "runs" / "other" / "seed-0", Config("Hopper"), rows([7.0, float("nan")]))
     (a_run(tmp_path / "runs" / "none" / "seed-0", Config("Ant"), []) / "run.json").write_text("{}")
     return tmp_path / "runs"
+
+
+def test_a_level_of_no_task_is_refused(folder):
+    with pytest.raises(ConfigError, match=r"level: expected one of the tasks .*Swimmer.*, got Swimer"):
+        compare(find([folder]).runs, {"Swimer": 1.0})
 
 
 def test_runs_of_one_seed_are_not_taken_for_seeds(folder):
@@ -107,6 +113,13 @@ def test_the_table_is_written_in_every_format(ending, folder, tmp_path, capsys):
         assert "| Swimmer | me-trpo | 3 | 300 | 24.0 |" in text
         assert "| 20.0 | 30.0 | -1.5 | -10.0 |" in text
         assert text.endswith("point itself.\n")
+
+
+def test_cells_are_text_in_every_format():
+    cell = "a|b<x>&$"
+    assert markdown_row([cell]) == r"| a\|b&lt;x>&$ |"
+    assert r"a\textbar{}b\textless{}x\textgreater{}\&\$" in written("tex", ["h"], [[cell]], [])
+    assert "a|b&lt;x&gt;&amp;$" in written("html", ["h"], [[cell]], [])
 
 
 def test_the_command_prints_a_table_or_json(folder, capsys):

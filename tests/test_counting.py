@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import metrpo
-from metrpo.counting import counted
+from metrpo.counting import counted, named_value
 
 NOUNS = "iterations|episodes|actions|steps|real steps|runs|trials|seeds|updates|numbers"
 
@@ -27,3 +27,8 @@ def test_messages_count_by_it():
         if by_hand.search(line) and "expected at least" not in line
     ]
     assert found == []
+
+
+def test_values_in_names():
+    values = [5, (1024, 1024), ("gain=2.0", "mode=a"), True]
+    assert [named_value(value) for value in values] == ["5", "1024x1024", "gain=2.0+mode=a", "True"]

@@ -68,7 +68,7 @@ def compare(
     last returns. `against` is the label of the group that others are held against, by default me-trpo, or a task's
     first where it has none.
 
-    Raises `ConfigError` when no run has a return, or no group is called `against`.
+    Raises `ConfigError` when no run has a return, no group is called `against`, or a level is for a task without runs.
     """
     groups = [g for g in map(_measured, group(runs)) if g.runs]
     if not groups:
@@ -76,8 +76,12 @@ def compare(
     labels = list(dict.fromkeys(g.label for g in groups))
     if against is not None and against not in labels:
         raise ConfigError(f"against: expected one of {', '.join(labels)}, got {against}")
+    tasks = list(dict.fromkeys(g.task for g in groups))
+    for task in levels if isinstance(levels, Mapping) else ():
+        if task not in tasks:
+            raise ConfigError(f"level: expected one of the tasks {', '.join(tasks)}, got {task}")
     found = []
-    for task in dict.fromkeys(g.task for g in groups):
+    for task in tasks:
         here = [g for g in groups if g.task == task]
         reference = next((g for name in (against, "me-trpo") for g in here if g.label == name), here[0])
         given = levels.get(task) if isinstance(levels, Mapping) else levels

@@ -247,3 +247,10 @@ def test_the_command_runs_the_grid_and_says_how_it_ended(tmp_path, monkeypatch, 
     assert main.main([*command, "--dry-run"]) == 0
     assert capsys.readouterr().out.count("metrpo train Swimmer") == 4
     assert len(asked) == 1
+
+
+def test_a_range_without_seeds_says_so():
+    with pytest.raises(ConfigError, match=r"got '3:1', which holds none$"):
+        seeds_of("3:1")
+    with pytest.raises(ConfigError, match=r"got 'a'$"):
+        seeds_of("a")

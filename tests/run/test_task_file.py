@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import json
+import re
 import sys
 import textwrap
 from pathlib import Path
@@ -79,6 +80,8 @@ def test_a_module_of_the_current_folder_is_found(tmp_path, monkeypatch):
     write("there/other_task.py", MAKE, horizon=40)
     with pytest.raises(TaskError, match=r"expected a module other_task in .*, found none; go to the folder that holds"):
         get_task("other_task:make")
+    with pytest.raises(TaskError, match=f"expected a module no_such in {re.escape(str(tmp_path))} or on"):
+        get_task("mine/Env-v0", imports=["no_such"])
     write("needy_task.py", "import other_task")
     with pytest.raises(
         TaskError, match=r"cannot import needy_task \(ModuleNotFoundError: No module named 'other_task'"

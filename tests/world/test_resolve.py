@@ -106,6 +106,9 @@ def test_pendulum_by_its_id_is_the_same_task_every_time():
     assert get_task("swimmer").name == "Swimmer"
     with pytest.raises(TaskError, match="did you mean Pendulum-v1"):
         get_task("Pendulum-v9")
+    with pytest.raises(TaskError, match=r"--import MODULE registers your own") as error:
+        get_task("Tilted-v0")
+    assert "CartPole-" not in str(error.value), "its actions are discrete"
 
 
 FILE = """

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from metrpo.config import Config, difference, flatten, from_json
+from metrpo.counting import named_value
 from metrpo.errors import ConfigError
 from metrpo.presets import bare
 from metrpo.run.files import folder_name
@@ -42,7 +43,7 @@ def _words(values: dict[str, Any]) -> str:
 
 
 def _word(value: Any) -> str:
-    return folder_name("x".join(map(str, value)) if isinstance(value, tuple) else str(value))
+    return folder_name(named_value(value))
 
 
 def _is_run_of(folder: Path, config: Config) -> bool:

@@ -133,7 +133,7 @@ def _complaint(text: str, kind: type, arguments: Sequence[str]) -> str:
         expected = _KINDS.get(usage[1], usage[1]) if usage else "something else"
         return f"{wrong[1]}: expected {expected}, got {_given(wrong[1], arguments)}"
     if wrong := re.match(r"invalid choice '(.*)' for argument '(.*)'. Expected one of \((.*)\)", said):
-        choices = [choice for part in wrong[3].split(",") if (choice := part.strip("' "))]
+        choices = [choice for part in wrong[3].split(",") if (choice := part.strip("' ")) not in ("", "None")]
         near = difflib.get_close_matches(wrong[1], choices, 1)
         return f"{wrong[2]}: expected one of {', '.join(choices)}, got {wrong[1]}{_meant(near).rstrip(';')}"
     if wrong := re.match(r"Missing value for argument '(.*)'", said):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, get_args
 
 from metrpo.config import BUDGET_FIELDS, Preset, System
+from metrpo.counting import named_value
 from metrpo.errors import ConfigError
 from metrpo.launch.run_spec import RunSpec
 from metrpo.presets import usual_system
@@ -131,7 +132,10 @@ def seeds_of(text: str) -> tuple[int, ...]:
         except ValueError:
             seeds.append(-1)
     if not seeds or min(seeds) < 0:
-        raise ConfigError(f"seeds: expected a number, a range such as 0:5 or a list such as 0,2,7, got {text!r}")
+        raise ConfigError(
+            f"seeds: expected a number, a range such as 0:5 (0 to 4) or a list such as 0,2,7, got {text!r}"
+            f"{'' if seeds else ', which holds none'}"
+        )
     return tuple(dict.fromkeys(seeds))
 
 
@@ -172,10 +176,7 @@ def _hashable(value: Any) -> Any:
 def variant_name(system: str, overrides: tuple[tuple[str, Any], ...]) -> str:
     """The folder of a combination, such as "me-trpo,ensemble.members=5"; a hash replaces the end of a long name."""
 
-    def word(value: Any) -> str:
-        return "x".join(map(str, value)) if isinstance(value, tuple) else str(value)
-
-    name = ",".join([system, *(f"{name}={word(value)}" for name, value in overrides)]).replace("/", "-")
+    name = ",".join([system, *(f"{name}={named_value(value)}" for name, value in overrides)]).replace("/", "-")
     if len(encoded := name.encode()) <= _LONGEST:
         return name
     return f"{encoded[:_KEPT].decode(errors='ignore')},{hashlib.sha256(encoded).hexdigest()[:16]}"

@@ -5,15 +5,16 @@ from __future__ import annotations
 import csv
 import html
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from metrpo.errors import ConfigError
 
 Rows = Sequence[Sequence[str]]
-_BAR = "\\|"
 _TEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"} | {
     sign: f"\\{sign}" for sign in "&%$#_{}"
 }
+_TEX |= {"|": r"\textbar{}", "<": r"\textless{}", ">": r"\textgreater{}"}  # else other signs, in LaTeX's own encoding
+_MARKDOWN = {"|": "\\|", "<": "&lt;"}
 
 
 def written(kind: str, header: Sequence[str], rows: Rows, notes: Sequence[str]) -> str:
@@ -31,7 +32,11 @@ def markdown(header: Sequence[str], rows: Rows, notes: Sequence[str] = ()) -> st
 
 def markdown_row(cells: Sequence[str]) -> str:
     """A line of it."""
-    return f"| {' | '.join(cell.replace('|', _BAR) for cell in cells)} |"
+    return f"| {' | '.join(_escaped(cell, _MARKDOWN) for cell in cells)} |"
+
+
+def _escaped(cell: str, signs: Mapping[str, str]) -> str:
+    return "".join(signs.get(sign, sign) for sign in cell)
 
 
 def html_table(header: Sequence[str], rows: Rows) -> str:
@@ -49,7 +54,7 @@ def _csv(header: Sequence[str], rows: Rows, notes: Sequence[str]) -> str:
 
 def _latex(header: Sequence[str], rows: Rows, notes: Sequence[str]) -> str:
     def line(cells: Sequence[str]) -> str:
-        return " & ".join("".join(_TEX.get(sign, sign) for sign in cell) for cell in cells) + r" \\"
+        return " & ".join(_escaped(cell, _TEX) for cell in cells) + r" \\"
 
     columns = "ll" + "r" * (len(header) - 2)
     begin = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", line(header), r"\midrule"]

@@ -13,6 +13,7 @@ import numpy as np
 
 from metrpo import budget
 from metrpo.config import Config, difference, from_json
+from metrpo.counting import named_value
 from metrpo.errors import ConfigError, RunDirectoryError
 from metrpo.run import yardstick_record
 from metrpo.run.metrics import Row, column, read_metrics
@@ -190,7 +191,7 @@ def _value(config: Config, name: str) -> str:
     value: object = config
     for part in name.split("."):
         value = getattr(value, part)
-    return "x".join(map(str, value)) if isinstance(value, tuple) else str(value)
+    return named_value(value)
 
 
 def _folders(path: Path) -> list[Path]:

@@ -18,7 +18,7 @@ class Wandb(Tracker):
         """As `Tracker.start`."""
         import wandb
 
-        more = {} if earlier is None else {"id": earlier, "resume": "allow"}
+        more: dict[str, Any] = {} if earlier is None else {"id": earlier, "resume": "allow"}
         project = os.environ.get("WANDB_PROJECT", PROJECT)
         self._run: Any = wandb.init(project=project, name=title, config=settings, dir=run_dir, **more)
         return str(self._run.id)

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from metrpo.config import flatten
-from metrpo.counting import counted
+from metrpo.counting import counted, named_value
 from metrpo.tune.search import OBJECTIVE, Search
 
 if TYPE_CHECKING:
@@ -186,6 +186,4 @@ def shown(settings: Mapping[str, Any]) -> str:
 
 
 def _number(value: Any) -> str:
-    if isinstance(value, tuple):
-        return "x".join(map(str, value))
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{value:.3g}" if isinstance(value, float) else named_value(value)

@@ -53,13 +53,14 @@ def get_task(name: str, env_kwargs: Iterable[str] | Mapping[str, Any] = (), impo
     task = _with_formulas(name, arguments) if name in KNOWN else resolve(name, env_kwargs=arguments)
     if task is not None:
         return task
-    original = {known.lower(): known for known in (*_TASKS, *KNOWN, *gymnasium.registry)}
+    others = [spec.id for spec in gymnasium.registry.values() if not str(spec.entry_point).startswith("gymnasium.")]
+    original = {known.lower(): known for known in (*_TASKS, *KNOWN, *others)}
     names = list(original)
     near = [original[n] for n in difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.4)]
     hint = f"did you mean {' or '.join(near)}? " if near else ""
     raise TaskError(
-        f"unknown task {name!r}: {hint}known tasks: {', '.join(_TASKS)} (see: metrpo tasks), any Gymnasium id, "
-        "module:name or path/to/file.py:name"
+        f"unknown task {name!r}: {hint}known tasks: {', '.join(_TASKS)} (see: metrpo tasks), any Gymnasium id "
+        "(--import MODULE registers your own), module:name or path/to/file.py:name"
     )
 
 

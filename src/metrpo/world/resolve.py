@@ -217,8 +217,8 @@ def _import(module: str, name: str, folder: Path | None) -> Any:
         if path is not None or not f"{module}.".startswith(f"{error.name}."):  # what it imports is missing
             raise TaskError(f"{name}: cannot import {module} ({type(error).__name__}: {error})") from error
         raise MissingTaskError(
-            f"{name}: expected a module {module} in {folder} or on Python's path, found none; go to the folder that "
-            "holds it, or add that folder to PYTHONPATH"
+            f"{name}: expected a module {module} in {folder or Path.cwd()} or on Python's path, found none; go to the "
+            "folder that holds it, or add that folder to PYTHONPATH"
         ) from error
     except Exception as error:
         raise TaskError(f"{name}: cannot import {module} ({type(error).__name__}: {error})") from error
