@@ -133,7 +133,7 @@ def test_python_describes_itself(tmp_path):
     plain = {"hidden": [8], "env_kwargs": [], "imports": []}
     origin = {"metrpo": beside["metrpo"], "policy_sha256": beside["sha256"]}
     assert {**dataclasses.asdict(load_policy(tmp_path).info), **plain, **origin} == module.INFO
-    for fact in ("from policy import act", "S = 11, A = 3", "environment: Swimmer.", *origin.values(), "3 iterations"):
+    for fact in ("from policy import act", "S = 11, A = 3", "environment: Swimmer.", *origin.values(), "iteration 3 "):
         assert fact in module.__doc__
     assert str(tmp_path) not in path.read_text()
 
