@@ -150,9 +150,9 @@ def _add_legend(axes: Axes, where: Legend, room: float) -> None:
     """`room` is the width in pixels that a panel has: a legend below it has as many columns as fit."""
     if where == "none":
         return
-    below: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.14)}
-    for columns in (3, 2, 1) if where == "below" else (1,):
-        place = below | {"ncols": columns} if where == "below" else {"loc": "best"}
+    below = [{"loc": "upper center", "bbox_to_anchor": (0.5, -0.14), "ncols": columns} for columns in (3, 2, 1)]
+    places: list[dict[str, Any]] = below if where == "below" else [{"loc": "best"}]
+    for place in places:
         legend = axes.legend(frameon=False, fontsize=8, handlelength=3, **place)
         for text in legend.get_texts():
             text.set_parse_math(False)

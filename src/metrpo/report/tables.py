@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from metrpo.errors import ConfigError
 
 Rows = Sequence[Sequence[str]]
-_TEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"} | {
-    sign: f"\\{sign}" for sign in "&%$#_{}"
+_TEX = {sign: f"\\{sign}" for sign in "&%$#_{}"} | {
+    **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
+    **{"|": r"\textbar{}", "<": r"\textless{}", ">": r"\textgreater{}"},
 }
-_TEX |= {"|": r"\textbar{}", "<": r"\textless{}", ">": r"\textgreater{}"}  # else other signs, in LaTeX's own encoding
 _MARKDOWN = {"|": "\\|", "<": "&lt;"}
 
 
