@@ -12,7 +12,7 @@ from metrpo.commands.parse import parse
 from metrpo.config import Config, Preset, System, flatten, from_json, to_json
 from metrpo.errors import ConfigError
 from metrpo.launch.grid import Grid
-from metrpo.presets import LONG_HORIZON_ALL, configured, preset
+from metrpo.presets import BY_CRITICS, LONG_HORIZON_ALL, configured, preset
 from metrpo.systems import SYSTEMS
 from metrpo.world.registry import tasks
 
@@ -164,7 +164,8 @@ def test_fast_collects_no_more_than_the_paper_does_for_the_same_policy(task):
     fast, paper = preset(task), preset(task, "paper")
     assert fast.collect.steps <= paper.collect.steps
     assert fast.validate.threshold == paper.validate.threshold
-    assert fast.policy.hidden == paper.policy.hidden
+    if task not in BY_CRITICS:  # whose actor is another kind of policy
+        assert fast.policy.hidden == paper.policy.hidden
 
 
 @pytest.mark.parametrize(("variant", "task"), [("HopperUpright", "Hopper"), ("HumanoidStandup", "Humanoid")])
@@ -200,11 +201,13 @@ def test_long_horizon_changes_what_its_row_says_and_nothing_else(task):
         ("Pendulum-v1", {}, "me-trpo"),
         ("Swimmer", {}, "me-trpo"),
         ("HumanoidStandup", {}, "me-trpo"),
+        ("Ant", {}, "actor-critic"),
+        ("Ant", {"improver": "trpo"}, "me-trpo"),
         ("HalfCheetah-v5", {"improver": "ppo"}, "me-trpo"),
         ("HalfCheetah-v5", {"max_change": 0.5}, "me-trpo"),
     ],
 )
-def test_long_episodes_have_another_usual_system(task, settings, system):
+def test_long_episodes_and_ant_have_another_usual_system(task, settings, system):
     assert preset(task, **settings).system == system
     assert configured(task, "fast", None, settings).system == system
     words = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
@@ -213,10 +216,20 @@ def test_long_episodes_have_another_usual_system(task, settings, system):
     assert Grid((task,), settings={name: [value] for name, value in settings.items()}).runs()[0].system == system
 
 
+@pytest.mark.parametrize("task", ["mbbl/HalfCheetah", "Ant"])
 @pytest.mark.parametrize("name", ["paper", "long-horizon"])
-def test_other_presets_have_one_usual_system(name):
-    assert preset("mbbl/HalfCheetah", name).system == "me-trpo"
-    assert parse(["train", "mbbl/HalfCheetah", "--preset", name]).system == "me-trpo"
+def test_other_presets_have_one_usual_system(name, task):
+    assert preset(task, name).system == "me-trpo"
+    assert parse(["train", task, "--preset", name]).system == "me-trpo"
+
+
+def test_a_task_of_the_critics_differs_from_their_system_in_its_row_alone():
+    for task, row in BY_CRITICS.items():
+        usual, me_trpo = flatten(preset(task)), flatten(preset(task, system="me-trpo"))
+        assert usual == me_trpo | SYSTEMS["actor-critic"] | {"system": "actor-critic"} | row
+        # Who asks for a setting gets it.
+        assert preset(task, iterations=3).iterations == 3
+        assert configured(task, "fast", None, {"ensemble.probabilistic": True}).ensemble.probabilistic
 
 
 def test_settings_on_top():
