@@ -31,3 +31,21 @@ def test_runs_grids_and_searches_agree_on_a_spent_budget(given, iteration, real_
     if len(given) == 1:
         assert Search("Swimmer", {"trpo.max_kl": Range(0.01, 0.1)}, **given).is_spent(rows) is spent
     assert not budget.spent(config, [])
+
+
+@pytest.mark.parametrize(
+    ("task", "budget_of", "iteration", "real_steps", "left"),
+    [
+        ("Swimmer", {"iterations": 20}, 5, 7500, 15),
+        ("Swimmer", {"real_steps": 15_000}, 0, 0, None),
+        ("Swimmer", {"real_steps": 15_000}, 2, 3000, 8),
+        ("Swimmer", {"real_steps": 15_000}, 10, 15_000, 0),
+        # Its first iteration takes 3,000 random steps, the others 1,000.
+        ("Ant", {"real_steps": 20_000}, 1, 3000, 17),
+        ("Ant", {"real_steps": 20_000}, 11, 13_000, 7),
+        ("Ant", {"real_steps": 2000}, 1, 2000, 0),
+    ],
+)
+def test_the_iterations_left_are_those_that_a_run_will_have(task, budget_of, iteration, real_steps, left):
+    config = dataclasses.replace(preset(task), **budget_of)
+    assert budget.iterations_left(config, iteration, real_steps) == left

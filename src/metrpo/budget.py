@@ -38,4 +38,6 @@ def iterations_left(config: Config, iteration: int, real_steps: int) -> int | No
     left = steps_left(config, real_steps)
     if not real_steps:
         return None
-    return math.ceil(left * iteration / real_steps)
+    # The actor-critic's first iteration is longer than the others.
+    longer = max(0, steps_wanted(config, 0) - config.collect.steps)
+    return math.ceil(left * iteration / max(real_steps - longer, 1))

@@ -94,6 +94,15 @@ def test_plain_lines_are_one_per_stage_and_one_per_iteration():
     assert "\x1b" not in out.getvalue()
 
 
+def test_nothing_is_said_of_time_left_after_the_last_iteration():
+    out = io.StringIO()
+    progress = PlainProgress(out)
+    progress.begin(1, 1)
+    progress.end({"real_steps": 3000, "return_real": 1.0}, 0.0)
+    assert "3,000 real steps" in out.getvalue()
+    assert "left" not in out.getvalue()
+
+
 def test_the_live_display_shows_stage_bar_and_results():
     out = io.StringIO()
     play(LiveProgress(Console(file=out, force_terminal=True, width=100)), pause=0.5)

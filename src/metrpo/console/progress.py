@@ -287,7 +287,7 @@ def _heading(iteration: int, of: int | None) -> str:
 
 
 def _left(seconds: float | None) -> str:
-    return "" if seconds is None else f"   about {duration(seconds)} left"
+    return "" if not seconds else f"   about {duration(seconds)} left"
 
 
 def _number(value: float | None) -> str:
