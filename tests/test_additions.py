@@ -76,15 +76,16 @@ def test_a_new_command_is_one_file_and_one_row(tmp_path):
 
 
 def test_a_new_sampling_and_a_new_improver_are_a_row_and_a_name_each(tmp_path):
-    """In a scratch copy of the package: they run by name, and the files that change are these three."""
+    """In a scratch copy of the package: they run by name, and the files that change are these four."""
     package = scratch_copy(tmp_path)
     for name, text in (("model/sampling.py", SAMPLING), ("policy/improvers/improver_table.py", IMPROVER)):
         (package / name).write_text((package / name).read_text() + text)
-    schema = package / "config" / "schema.py"
-    choices = schema.read_text().replace('"one_model"] = "step_rand"', '"one_model", "boldest_model"] = "step_rand"')
-    schema.write_text(
-        choices.replace('"bptt-stochastic", "actor-critic"]', '"bptt-stochastic", "bold", "actor-critic"]')
-    )
+    for name, choice, choices in (
+        ("stage_settings.py", '"one_model"] = "step_rand"', '"one_model", "boldest_model"] = "step_rand"'),
+        ("schema.py", '"bptt-stochastic", "actor-critic"]', '"bptt-stochastic", "bold", "actor-critic"]'),
+    ):
+        file = package / "config" / name
+        file.write_text(file.read_text().replace(choice, choices))
     chosen = ["--iterations", "1", "--imagine.sampling", "boldest_model", "--improver", "bold"]
     line = tiny_run.process_line(tmp_path / "run", *chosen)
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (tmp_path, SUPPORT)))}

@@ -1,26 +1,17 @@
 """Every setting of a run, and its JSON."""
 
-from metrpo.config.schema import (
-    BUDGET_FIELDS,
-    ActorCriticConfig,
+from metrpo.config.improver_settings import ActorCriticConfig, GradientConfig, PPOConfig, SVGConfig, TRPOConfig
+from metrpo.config.schema import BUDGET_FIELDS, Config, ImproverName, Method, Preset, System
+from metrpo.config.serialise import ADDED, convert, difference, flatten, from_json, to_json
+from metrpo.config.stage_settings import (
     AdvantageConfig,
     CollectConfig,
-    Config,
     EnsembleConfig,
     FitConfig,
-    GradientConfig,
     ImagineConfig,
-    ImproverName,
-    Method,
     PolicyConfig,
-    PPOConfig,
-    Preset,
-    SVGConfig,
-    System,
-    TRPOConfig,
     ValidateConfig,
 )
-from metrpo.config.serialise import ADDED, convert, difference, flatten, from_json, to_json
 
 __all__ = [
     "ADDED",
