@@ -24,8 +24,9 @@ if TYPE_CHECKING:
     from metrpo.evaluation import EvaluationResult, evaluate, render
     from metrpo.presets import preset
     from metrpo.run.episodes import append_episode
+    from metrpo.run.loaded_policy import LoadedPolicy
     from metrpo.run.metrics import read_metrics
-    from metrpo.run.policy_file import LoadedPolicy, load_policy
+    from metrpo.run.policy_file import load_policy
     from metrpo.training import init, step, train
     from metrpo.world.interface import Interface
     from metrpo.world.registry import get_task, tasks
@@ -67,8 +68,9 @@ _HOME = {
     "metrpo.evaluation": ("EvaluationResult", "evaluate", "render"),
     "metrpo.presets": ("preset",),
     "metrpo.run.episodes": ("append_episode",),
+    "metrpo.run.loaded_policy": ("LoadedPolicy",),
     "metrpo.run.metrics": ("read_metrics",),
-    "metrpo.run.policy_file": ("LoadedPolicy", "load_policy"),
+    "metrpo.run.policy_file": ("load_policy",),
     "metrpo.training": ("init", "step", "train"),
     "metrpo.world.interface": ("Interface",),
     "metrpo.world.resolve": ("task_of",),

@@ -14,7 +14,8 @@ from metrpo.errors import ConfigError, TaskError
 from metrpo.hub import is_on_hub
 from metrpo.limits import Limits
 from metrpo.policy_zoo import is_in_zoo, is_name, located
-from metrpo.run.policy_file import LoadedPolicy, PolicyInfo, load_policy
+from metrpo.run.loaded_policy import LoadedPolicy, PolicyInfo
+from metrpo.run.policy_file import load_policy
 from metrpo.run.task_file import task_of_run
 from metrpo.run.video import record
 from metrpo.safe_load import brief

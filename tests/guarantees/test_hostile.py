@@ -40,9 +40,10 @@ from metrpo.run.checkpoint import load_state
 from metrpo.run.directory import RunDirectory, stored_config
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.files import read_arrays, write_arrays
+from metrpo.run.loaded_policy import LoadedPolicy
 from metrpo.run.metrics import read_metrics, to_csv
 from metrpo.run.policy_export import export
-from metrpo.run.policy_file import Learned, LoadedPolicy, load_policy, save_policy
+from metrpo.run.policy_file import Learned, load_policy, save_policy
 from metrpo.world import offline_data
 
 CONFIG = override(

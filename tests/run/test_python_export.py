@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 from exported import HOSTILE, A, S, python, rename, saved
 from helpers import random_policy
 from metrpo.errors import RunDirectoryError
+from metrpo.run.loaded_policy import PolicyInfo
 from metrpo.run.policy_export import export
-from metrpo.run.policy_file import Learned, PolicyInfo, load_policy, save_policy
+from metrpo.run.policy_file import Learned, load_policy, save_policy
 from metrpo.world.interface import Interface
 from metrpo.world.registry import get_task
 

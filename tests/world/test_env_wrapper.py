@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import probe
 from metrpo import evaluation
 from metrpo.errors import TaskError
-from metrpo.run.policy_file import LoadedPolicy, PolicyInfo
+from metrpo.run.loaded_policy import LoadedPolicy, PolicyInfo
 from metrpo.run.video import VideoError
 from metrpo.world import collection as real
 from metrpo.world import registry

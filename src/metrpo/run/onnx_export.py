@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from metrpo.errors import MetrpoError
-from metrpo.run.policy_file import LoadedPolicy
+from metrpo.run.loaded_policy import LoadedPolicy
 
 _OPSET = 13
 """Of 2020: nearly every runtime in use reads it."""

@@ -14,8 +14,9 @@ from typing import Any
 from metrpo.errors import MetrpoError, RunDirectoryError
 from metrpo.policy_zoo import is_name, located
 from metrpo.run.files import atomic_write, metrpo_version
+from metrpo.run.loaded_policy import LoadedPolicy
 from metrpo.run.onnx_export import onnx_model
-from metrpo.run.policy_file import FILE, LoadedPolicy, load_policy, with_interface
+from metrpo.run.policy_file import FILE, load_policy, with_interface
 from metrpo.run.python_export import python_source
 from metrpo.run.python_template import SOURCE
 from metrpo.safe_load import opened

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from metrpo.history import History
-from metrpo.run.policy_file import LoadedPolicy
+from metrpo.run.loaded_policy import LoadedPolicy
 from metrpo.run.python_template import BEGIN, RELATIVE, REMEMBER, SOURCE
 
 
