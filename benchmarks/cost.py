@@ -25,6 +25,7 @@ from matplotlib.figure import Figure  # noqa: E402
 
 from metrpo import get_task, policy_phase, preset  # noqa: E402
 from metrpo.model import ensemble as ensembles  # noqa: E402
+from metrpo.model.ensemble import Ensemble  # noqa: E402
 from metrpo.model.fit import fit  # noqa: E402
 from metrpo.policy import gaussian  # noqa: E402
 from metrpo.policy.improvers.improver_table import init_memory  # noqa: E402
@@ -68,7 +69,7 @@ def cost(transitions: int, models: int, width: int, horizon: int, repeats: int =
     seconds: dict[str, list[float]] = {"fit": [], "improve": []}
     for _ in range(repeats + 1):
         start = time.perf_counter()
-        ensemble, info = fit(networks, normaliser, train, validation, fitting, jax.random.key(0))
+        ensemble, info = fit(Ensemble(networks, normaliser), train, validation, fitting, jax.random.key(0))
         jax.block_until_ready(ensemble)
         # Whole passes only: brought to the same number of steps.
         seconds["fit"].append((time.perf_counter() - start) * STEPS / (info.passes * per_pass))

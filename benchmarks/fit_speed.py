@@ -19,6 +19,7 @@ import numpy as np
 
 from metrpo import config, get_task, init
 from metrpo.model import ensemble as ensembles
+from metrpo.model.ensemble import Activation, Ensemble
 from metrpo.model.fit import fit
 from metrpo.presets import override
 from metrpo.run.directory import RunDirectory
@@ -57,8 +58,9 @@ def main() -> None:
             validation = first(state.dataset.validation, share, now.collect.max_validation)
             real = Transitions(*(np.asarray(x[: int(train.size)]) for x in train[:3]), int(train.size))
             normaliser = ensembles.normaliser_of(real, e.std_floor, e.delta_std_floor, task.unseen)
+            before = Ensemble(networks, normaliser, activation=Activation(e.activation))
             start = time.perf_counter()
-            ensemble, info = fit(networks, normaliser, train, validation, now.fit, jax.random.key(iteration))
+            ensemble, info = fit(before, train, validation, now.fit, jax.random.key(iteration))
             losses.append(float(np.mean(info.validation_loss)))
             seconds.append(time.perf_counter() - start)
             networks = ensemble.networks

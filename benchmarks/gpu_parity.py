@@ -93,7 +93,7 @@ def results(size: Size, nudge: float) -> Results:
 def _fit(size: Size, ensemble: Ensemble, train: Transitions) -> Results:
     config = FitConfig(batch_size=size.batch, max_passes=5, patience=99)
     data = jax.device_put(train)
-    fitted, info = fit(ensemble.networks, ensemble.normaliser, data, data, config, jax.random.key(0))
+    fitted, info = fit(ensemble, data, data, config, jax.random.key(0))
     change = jax.tree.map(lambda new, old: np.asarray(new) - old, fitted.networks, ensemble.networks)
     return {
         "fit: loss before": np.asarray(validation_loss(ensemble, data)),

@@ -50,7 +50,9 @@ def main() -> None:
     settings, state = newest_of(arguments.run_dir)
     task, e = task_for(settings), settings.ensemble
     normaliser = ensembles.normaliser_of(state.dataset.train, e.std_floor, e.delta_std_floor, task.unseen)
-    ensemble = ensembles.Ensemble(state.networks, normaliser, ensembles.Carried(task.carried))
+    ensemble = ensembles.Ensemble(
+        state.networks, normaliser, ensembles.Carried(task.carried), ensembles.Activation(e.activation)
+    )
     act = partial(gaussian.mean, jax.tree.map(np.asarray, state.policy))
     rng, steps = np.random.default_rng(2**40), arguments.episodes * task.horizon
     episodes = collect(task, lambda rng: explore(act, settings.collect, rng), steps, rng)

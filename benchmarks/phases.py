@@ -23,7 +23,7 @@ from metrpo.config import Config
 from metrpo.console.progress import SILENT
 from metrpo.model import ensemble as ensembles
 from metrpo.model.diagnostics import diagnose
-from metrpo.model.ensemble import Carried, Ensemble
+from metrpo.model.ensemble import Activation, Carried, Ensemble
 from metrpo.policy.value.value_table import init_baseline
 from metrpo.presets import override
 from metrpo.run.clock import Clock
@@ -55,7 +55,7 @@ def phases(config: Config, state: State, count: int, fresh: bool, variant: str, 
     config = override(config, {"seed": seed})
     task, e, data = task_for(config), config.ensemble, state.dataset
     normaliser = ensembles.normaliser_of(data.train, e.std_floor, e.delta_std_floor, task.unseen)
-    ensemble = Ensemble(state.networks, normaliser, Carried(task.carried))
+    ensemble = Ensemble(state.networks, normaliser, Carried(task.carried), Activation(e.activation))
     first = init(config).policy if fresh else state.policy
     baseline = init_baseline(config.advantage, task.state_size, key_of(seed, 0, Stage.IMPROVE))
     state = state._replace(policy=first, baseline=baseline)

@@ -30,6 +30,7 @@ from metrpo import devices
 FIT = """
 from metrpo.config import FitConfig
 from metrpo.model import ensemble as ensembles
+from metrpo.model.ensemble import Ensemble
 from metrpo.model.fit import fit
 from metrpo.types import Transitions
 rng = np.random.default_rng(0)
@@ -37,7 +38,8 @@ states, actions = (rng.normal(size=(300, n)).astype(np.float32) for n in (3, 2))
 data = Transitions(states, actions, np.tanh(states) * actions[:, :1], 300)
 networks = ensembles.init(jax.random.key(0), 6, 3, 2, (16,))
 normaliser = ensembles.normaliser_of(data, 0.1, 0.1)
-fitted, info = fit(networks, normaliser, data, data, FitConfig(batch_size=32, max_passes=5), jax.random.key(1))
+start = Ensemble(networks, normaliser)
+fitted, info = fit(start, data, data, FitConfig(batch_size=32, max_passes=5), jax.random.key(1))
 weights = fitted.networks[0][0]
 assert weights.sharding.shard_shape(weights.shape)[0] == 6 // len(jax.devices()), "every device has members of its own"
 np.savez(OUT, *jax.tree.leaves(fitted), *jax.tree.leaves(info))
@@ -95,7 +97,7 @@ WIDE = """
 from jax.sharding import Mesh
 from metrpo.history import History
 from metrpo.model import imagine as module
-from metrpo.model.ensemble import Carried, Ensemble
+from metrpo.model.ensemble import Activation, Carried, Ensemble
 from metrpo.types import Trajectories
 module.CORE_CACHE = 100  # bytes; the largest layer has more
 policy = random_policy(0, 4, 2, hidden=(8,))
@@ -143,12 +145,15 @@ for members, count, hidden, sampling, curiosity in (
     (5, 4, (16, 8, 8, 16), "step_rand", 0.1),
     (3, 2, (16, 16), "step_rand", 0.0),  # one each, and one cut in two
     (3, 2, (16,), "step_rand", "noise"),
+    (3, 4, (16,), "step_rand", "silu"),
 ):
     ensemble = random_ensemble(members=members, scale=0.3, hidden=hidden)
     if curiosity == "history":
         ensemble, curiosity = of_one_observation(ensemble), 0.0
     if curiosity == "noise":
         ensemble, curiosity = probabilistic(ensemble), 0.0
+    if curiosity == "silu":
+        ensemble, curiosity = ensemble._replace(activation=Activation("silu")), 0.0
     rows = 24 // count // members  # for each model, on a device with models of its own
     apart = found(ensemble, count, rows, sampling, curiosity)
     assert not divided

@@ -34,6 +34,7 @@ CITED = {
     "collect.max_validation": (100_000, "code: first in, first out"),
     "ensemble.members": (5, 'B, "Ablation study": ME-TRPO with 5 models'),
     "ensemble.hidden": ((1024, 1024), "A.1.2: hidden sizes 1024-1024"),
+    "ensemble.activation": ("relu", "A.1.2: ReLU nonlinearities"),
     "ensemble.probabilistic": (False, "equation 1: the L2 norm of the error alone"),
     "ensemble.std_floor": (0.1, "code: floor of the normaliser"),
     "ensemble.delta_std_floor": (0.1, "code: floor of the normaliser, one for inputs and outputs"),
@@ -229,13 +230,28 @@ def test_a_task_of_the_critics_differs_from_their_system_in_its_row_alone():
         assert usual == me_trpo | SYSTEMS["actor-critic"] | {"system": "actor-critic"} | row
         # Who asks for a setting gets it.
         assert preset(task, iterations=3).iterations == 3
-        assert configured(task, "fast", None, {"ensemble.probabilistic": True}).ensemble.probabilistic
+        assert not configured(task, "fast", None, {"ensemble.probabilistic": False}).ensemble.probabilistic
 
 
 def test_settings_on_top():
     config = preset("Swimmer", "paper", seed=3, iterations=2)
     assert (config.seed, config.iterations) == (3, 2)
     assert isinstance(config, Config)
+
+
+def test_settings_that_need_each_other_may_come_in_any_order():
+    both = {"fit.decay": True, "fit.max_steps": 100}
+    for values in (both, dict(reversed(both.items()))):
+        fit = configured("Swimmer", "paper", None, values).fit
+        assert (fit.decay, fit.max_steps) == (True, 100)
+    with pytest.raises(ConfigError, match=r"fit.max_steps: expected a number of steps with fit.decay, got None"):
+        configured("Swimmer", "paper", None, {"fit.decay": True})
+
+
+@pytest.mark.parametrize("name", ["colour", "fit.colour", "fit.decay.colour", "seed.colour"])
+def test_an_unknown_setting_is_named_whole(name):
+    with pytest.raises(ConfigError, match=f"unknown setting '{name}'"):
+        configured("Swimmer", "fast", None, {name: 1})
 
 
 def test_an_unknown_preset_is_refused():

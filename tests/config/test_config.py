@@ -197,6 +197,7 @@ FREE = {
     "policy.normalise",
 }
 FREE |= {
+    "ensemble.activation",
     "ensemble.probabilistic",
     "fit.decay",
     "validate.rule",

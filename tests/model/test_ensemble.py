@@ -23,10 +23,11 @@ from metrpo.types import Transitions
 predict, predict_delta = on_host()(ensembles.predict), on_host()(ensembles.predict_delta)
 
 
+@pytest.mark.parametrize("activation", ["relu", "silu"])
 @pytest.mark.parametrize("hidden", [(), (8,), (8, 6)])
-def test_prediction_is_each_members_own_relu_network(hidden):
+def test_prediction_is_each_members_own_network(hidden, activation):
     rng = np.random.default_rng(0)
-    ensemble = random_ensemble(1, members=3, hidden=hidden)
+    ensemble = random_ensemble(1, members=3, hidden=hidden)._replace(activation=ensembles.Activation(activation))
     states, actions = rng.normal(size=(3, 5, 4)).astype(np.float32), rng.normal(size=(3, 5, 2)).astype(np.float32)
     delta = predict_delta(ensemble, states, actions)
     expected = [[slow_delta(ensemble, k, states[k, b], actions[k, b]) for b in range(5)] for k in range(3)]

@@ -54,7 +54,7 @@ def test_validation_loss_below_one_chunk_in_either_unit():
 
 
 class SlowMember:
-    """One ReLU network and its Adam(W), in float64 NumPy, with the gradient worked out by hand."""
+    """One network and its Adam(W), in float64 NumPy, with the gradient worked out by hand."""
 
     def __init__(self, ensemble, k, config):
         self.ensemble, self.config, self.steps = ensemble, config, 0
@@ -66,15 +66,18 @@ class SlowMember:
         inputs = [
             np.concatenate([(states - n.state_mean) * n.state_scale, (actions - n.action_mean) * n.action_scale], 1)
         ]
+        slopes, smooth = [], self.ensemble.activation.name == "silu"
         for i, (weights, biases) in enumerate(self.layers):
             h = inputs[-1] @ weights + biases
-            inputs.append(np.maximum(h, 0) if i < len(self.layers) - 1 else h)
+            sigmoid = 1 / (1 + np.exp(-h)) if smooth else (h > 0).astype(float)
+            slopes.append(sigmoid * (1 + h * (1 - sigmoid)) if smooth else sigmoid)
+            inputs.append(h * sigmoid if i < len(self.layers) - 1 else h)
         unit = n.delta_std if self.config.loss_units == "std" else 1.0
         back = 2 * (n.delta_mean + n.delta_std * inputs[-1] - deltas) / unit**2 * n.delta_std / len(states)
         gradients = []
         for i, (weights, _) in reversed(list(enumerate(self.layers))):
             if i < len(self.layers) - 1:
-                back = back * (inputs[i + 1] > 0)
+                back = back * slopes[i]
             gradients.insert(0, (inputs[i].T @ back, back.sum(0, keepdims=True)))
             back = back @ weights.T
         return gradients
@@ -117,21 +120,28 @@ NOISY = FitConfig(learning_rate=0.03, batch_size=10, validate_every=2, max_passe
 
 
 @pytest.mark.parametrize(
-    ("size", "config"),
+    ("size", "config", "activation"),
     [
-        (33, NOISY),
-        (33, replace(NOISY, loss_units="std", weight_decay=2.0)),
-        (33, replace(NOISY, weight_decay=2.0, decay=True, max_steps=48)),
-        (5, replace(NOISY, validate_every=1)),
+        (33, NOISY, "relu"),
+        (33, NOISY, "silu"),
+        (33, replace(NOISY, loss_units="std", weight_decay=2.0), "relu"),
+        (33, replace(NOISY, weight_decay=2.0, decay=True, max_steps=48), "relu"),
+        (5, replace(NOISY, validate_every=1), "relu"),
     ],
-    ids=["minibatches", "weights decay, units of std", "steps fall to 0", "fewer rows than a minibatch"],
+    ids=[
+        "minibatches",
+        "smooth units",
+        "weights decay, units of std",
+        "steps fall to 0",
+        "fewer rows than a minibatch",
+    ],
 )
-def test_each_member_trains_alone_and_returns_to_its_own_best(size, config):
+def test_each_member_trains_alone_and_returns_to_its_own_best(size, config, activation):
     """Each slice equals that member's training by itself; few noisy rows make the best passes differ."""
-    ensemble = random_ensemble(3, hidden=(8,))
+    ensemble = random_ensemble(3, hidden=(8,))._replace(activation=ensembles.Activation(activation))
     rng = np.random.default_rng(size)
     train, validation = random_transitions(rng, size, capacity=40), random_transitions(rng, 30)
-    fitted, info = fit(ensemble.networks, ensemble.normaliser, train, validation, config, KEY)
+    fitted, info = fit(ensemble, train, validation, config, KEY)
     best_blocks = []
     for k in range(3):
         losses, layers = slow_fit(ensemble, k, train, validation, config)
@@ -176,7 +186,9 @@ def test_other_members_have_no_influence(k, garbage):
 
     others = np.arange(3).reshape(3, 1, 1) != k
     spoilt = jax.tree.map(lambda x: np.where(others, spoil(x), x).astype(np.float32), networks)
-    (clean, info), (dirty, dirty_info) = (fit(n, normaliser, train, validation, SHORT, KEY) for n in (networks, spoilt))
+    (clean, info), (dirty, dirty_info) = (
+        fit(Ensemble(n, normaliser), train, validation, SHORT, KEY) for n in (networks, spoilt)
+    )
     for ours, theirs in zip(member(dirty, k).networks, member(clean, k).networks, strict=True):
         np.testing.assert_allclose(ours[0], theirs[0], atol=1e-6)
         np.testing.assert_allclose(ours[1], theirs[1], atol=1e-6)
@@ -188,7 +200,7 @@ def test_the_first_member_of_many_is_the_only_member_of_one():
     train, validation = a_system(60)[0], a_system(30, seed=1)[0]
     normaliser = ensembles.normaliser_of(train, 0.1, 0.1)
     three, one = (
-        fit(e.networks, normaliser, train, validation, SHORT, KEY)[0]
+        fit(Ensemble(e.networks, normaliser), train, validation, SHORT, KEY)[0]
         for e in (random_ensemble(1), member(random_ensemble(1), 0))
     )
     for ours, theirs in zip(jax.tree.leaves(member(three, 0).networks), jax.tree.leaves(one.networks), strict=True):
@@ -203,7 +215,7 @@ def test_members_trained_at_once_equal_those_trained_in_turn(monkeypatch):
     for backend in ("cpu", "gpu"):
         monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
         train_and_validate.clear_cache()
-        found.append(fit(start.networks, start.normaliser, train, validation, SHORT, KEY))
+        found.append(fit(start, train, validation, SHORT, KEY))
     train_and_validate.clear_cache()
     for ours, theirs in zip(*map(jax.tree.leaves, found), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
@@ -213,7 +225,7 @@ def test_a_diverged_member_keeps_its_best_weights():
     train, validation = a_system(60)[0], a_system(30, seed=1)[0]
     start = random_ensemble(2)._replace(normaliser=ensembles.normaliser_of(train, 0.1, 0.1))
     train.deltas[:] = 1e30  # squares overflow: the loss is infinite and the gradient is not a number
-    fitted, info = fit(start.networks, start.normaliser, train, validation, SHORT, KEY)
+    fitted, info = fit(start, train, validation, SHORT, KEY)
     assert jax.tree.all(jax.tree.map(np.array_equal, fitted.networks, start.networks))
     assert not np.any(info.best_pass)
     assert np.all(np.isfinite(info.validation_loss))
@@ -259,7 +271,7 @@ def test_fitting_stops_when_no_member_improves_within_patience(monkeypatch, impr
     def tell(passes, losses):
         told.append((passes, np.array(losses)))
 
-    _, info = fit(*ensemble[:2], train, validation, config, KEY, tell)
+    _, info = fit(ensemble, train, validation, config, KEY, tell)
     assert info.passes == passes
     every = config.validate_every
     # 3,500 rows are 3 minibatches of 1,000: a pass is 3 steps, whatever the capacity.
@@ -283,8 +295,8 @@ def test_capacity_beyond_the_size_has_no_influence():
             *(np.pad(x, ((0, capacity - len(x)), (0, 0)), constant_values=garbage) for x in t[:3]), t.size
         )
 
-    exact = fit(*ensemble[:2], train, validation, SHORT, KEY)
-    roomy = fit(*ensemble[:2], padded(train, 100), padded(validation, 1500), SHORT, KEY)
+    exact = fit(ensemble, train, validation, SHORT, KEY)
+    roomy = fit(ensemble, padded(train, 100), padded(validation, 1500), SHORT, KEY)
     for ours, theirs in zip(jax.tree.leaves(roomy), jax.tree.leaves(exact), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-6)
 
@@ -294,7 +306,7 @@ def test_the_callers_arrays_stay_usable():
     ensemble = random_ensemble(1)._replace(normaliser=ensembles.normaliser_of(train, 0.1, 0.1))
     given = jax.tree.map(jnp.asarray, (ensemble, train, validation))
     before = jax.tree.map(np.array, given)
-    fit(*given[0][:2], given[1], given[2], SHORT, KEY)
+    fit(given[0], given[1], given[2], SHORT, KEY)
     assert not any(x.is_deleted() for x in jax.tree.leaves(given))
     assert jax.tree.all(jax.tree.map(np.array_equal, given, before))
 
@@ -311,7 +323,7 @@ def test_fitting_learns_a_known_system():
     def keep(passes, loss):
         losses.append(np.array(loss))
 
-    fitted, info = fit(networks, normaliser, train, validation, config, KEY, keep)
+    fitted, info = fit(Ensemble(networks, normaliser), train, validation, config, KEY, keep)
     assert np.all(info.validation_loss < 0.01 * before)
     assert np.all(np.diff(np.array([before, *losses]), axis=0) <= 0), "the best so far never gets worse"
     fresh, _ = a_system(50, seed=2)

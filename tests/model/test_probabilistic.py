@@ -41,7 +41,7 @@ def fitted():
     normaliser = ensembles.normaliser_of(train, 0.1, 0.1)
     networks = ensembles.init(KEY, 2, 2, 1, (32, 32), probabilistic=True)
     config = FitConfig(learning_rate=3e-3, batch_size=100, validate_every=5, max_passes=60, patience=60)
-    return fit(networks, normaliser, train, validation, config, KEY)[0]
+    return fit(Ensemble(networks, normaliser), train, validation, config, KEY)[0]
 
 
 def held_out(count=2000):
@@ -106,7 +106,7 @@ def test_the_mean_learns_what_it_would_learn_without_a_spread():
     plain = (*inner, (weights[..., :2], biases[..., :2]))
     for settings in (config, replace(config, loss_units="std")):
         (ours, info), (theirs, its) = (
-            fit(networks, normaliser, train, validation, settings, KEY) for networks in (probabilistic, plain)
+            fit(Ensemble(networks, normaliser), train, validation, settings, KEY) for networks in (probabilistic, plain)
         )
         np.testing.assert_allclose(info.validation_loss, its.validation_loss, rtol=1e-4)
         np.testing.assert_allclose(ours.networks[0][0], theirs.networks[0][0], atol=1e-4)

@@ -94,7 +94,7 @@ def slow_delta(ensemble, k, state, action):
     for i, (weights, biases) in enumerate(ensemble.networks):
         h = h @ np.asarray(weights[k], np.float64) + np.asarray(biases[k, 0], np.float64)
         if i < len(ensemble.networks) - 1:
-            h = np.maximum(h, 0)
+            h = h / (1 + np.exp(-h)) if ensemble.activation.name == "silu" else np.maximum(h, 0)
     return n.delta_mean + n.delta_std * h
 
 

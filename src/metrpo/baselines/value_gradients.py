@@ -23,7 +23,7 @@ from metrpo.config import Config, FitConfig, GradientConfig, SVGConfig
 from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import ConfigError
 from metrpo.model import ensemble as ensembles
-from metrpo.model.ensemble import Carried, Ensemble, Networks, predict
+from metrpo.model.ensemble import Activation, Carried, Ensemble, Networks, predict
 from metrpo.model.epochs import losses_of, minibatch
 from metrpo.policy import gaussian
 from metrpo.policy.advantage import discounted_returns
@@ -219,8 +219,10 @@ def _normaliser(config: Config, task: Task, replay: Transitions) -> Normaliser:
 def _fit(
     config: Config, state: SVGState, normaliser: Normaliser, replay: Transitions, key: Array
 ) -> tuple[SVGState, Array]:
-    learned = state.networks, state.model_moments
-    networks, moments, loss = _train_model(config.fit, config.svg.model_steps, *learned, normaliser, replay, key)
+    ensemble = Ensemble(state.networks, normaliser, activation=Activation(config.ensemble.activation))
+    networks, moments, loss = _train_model(
+        config.fit, config.svg.model_steps, ensemble, state.model_moments, replay, key
+    )
     return state._replace(networks=networks, model_moments=moments), loss
 
 
@@ -228,16 +230,15 @@ def _fit(
 def _train_model(
     config: FitConfig,
     steps: int,
-    networks: Networks,
+    ensemble: Ensemble,
     moments: Any,
-    normaliser: Normaliser,
     replay: Transitions,
     key: Array,
 ) -> tuple[Networks, Any, Array]:
     optimizer = optax.adam(config.learning_rate)
 
     def loss(networks: Networks, *batch: Array) -> Array:
-        return jnp.mean(losses_of(Ensemble(networks, normaliser), config.loss_units, *batch)[0])
+        return jnp.mean(losses_of(ensemble._replace(networks=networks), config.loss_units, *batch)[0])
 
     def step(carry: tuple[Networks, Any], key: Array) -> tuple[tuple[Networks, Any], Array]:
         networks, moments = carry
@@ -246,7 +247,7 @@ def _train_model(
         change, moments = optimizer.update(gradient, moments)
         return (optax.apply_updates(networks, change), moments), now
 
-    (networks, moments), losses = jax.lax.scan(step, (networks, moments), jax.random.split(key, steps))
+    (networks, moments), losses = jax.lax.scan(step, (ensemble.networks, moments), jax.random.split(key, steps))
     return networks, moments, jnp.mean(losses)
 
 
@@ -256,7 +257,7 @@ def _improve(
     learned, norm, made = _train_policy(
         PolicySettings(config.svg, config.gradient, config.advantage.discount),
         task,
-        Ensemble(state.networks, normaliser, Carried(task.carried)),
+        Ensemble(state.networks, normaliser, Carried(task.carried), Activation(config.ensemble.activation)),
         (state.policy, state.policy_moments, state.value, state.value_moments),
         path,
     )

@@ -120,11 +120,11 @@ class ActorCriticConfig:
     """Networks that value states and actions; the least of their targets counts."""
     critic_hidden: tuple[int, ...] = (256, 256)
     """Sizes of a critic's hidden layers (SiLU, normalised)."""
-    critic_learning_rate: float = 3e-4
+    critic_learning_rate: float = 1e-3
     """Adam's step size for the critics."""
     critic_steps: int = 1
     """The first so many states of an imagined episode are what critics learn from, each valued by all that follows."""
-    target_rate: float = 0.005
+    target_rate: float = 0.02
     """Share of the critics that goes into their moving average, the targets, at every update."""
     entropy_weight: float = 0.1
     """What a nat of the actor's entropy is worth in rewards, at first."""

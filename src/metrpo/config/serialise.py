@@ -18,6 +18,7 @@ from metrpo.safe_load import brief, json_of
 ADDED = (
     "config.collect.std_power",
     "config.collect.noise_correlation",
+    "config.ensemble.activation",
     "config.ensemble.probabilistic",
     "config.fit.decay",
     "config.fit.products",

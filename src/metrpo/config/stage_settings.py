@@ -66,7 +66,9 @@ class EnsembleConfig:
     members: int = 5
     """K, the number of models."""
     hidden: tuple[int, ...] = (1024, 1024)
-    """Sizes of the hidden layers (ReLU)."""
+    """Sizes of the hidden layers."""
+    activation: Literal["relu", "silu"] = "relu"
+    """What hidden units do. silu is smooth: a policy can follow its gradient."""
     std_floor: float = 0.1
     """The normaliser divides states and actions by their standard deviation, but at least by this."""
     delta_std_floor: float = 0.1

@@ -7,7 +7,7 @@ would have to be vmapped to the same products, so the forty lines are written ou
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -35,12 +35,29 @@ class Carried:
     """[S - O], within state and action, [S + A]; the next state's last numbers in order (`History.carried`)."""
 
 
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class Activation:
+    """What hidden units do: a pytree without arrays."""
+
+    name: Literal["relu", "silu"] = "relu"
+
+    def __call__(self, x: Float[Array, "K B I"]) -> Float[Array, "K B I"]:
+        """Of what reaches them."""
+        return jax.nn.silu(x) if self.name == "silu" else jax.nn.relu(x)
+
+
+RELU = Activation()
+"""The paper's (appendix A.1.2)."""
+
+
 class Ensemble(NamedTuple):
     """K networks and the normaliser that they share."""
 
     networks: Networks
     normaliser: Normaliser
     carried: Carried = Carried()
+    activation: Activation = RELU
 
     @property
     def members(self) -> int:
@@ -49,7 +66,7 @@ class Ensemble(NamedTuple):
 
     def outputs(self, x: Float[Array, "K B I"]) -> Float[Array, "K B E"]:
         """What the networks say, each member to its own batch."""
-        return network_outputs(self.networks, x, self.normaliser.delta_std.shape[-1])
+        return network_outputs(self.networks, x, self.activation, self.normaliser.delta_std.shape[-1])
 
     def first(self) -> Ensemble:
         """The first member as an ensemble of one."""
@@ -205,14 +222,16 @@ def mean_and_spread(
     return said[..., :size], said[..., size:].clip(*LOG_SPREAD)
 
 
-def network_outputs(networks: Networks, x: Float[Array, "K B I"], means: int | None = None) -> Float[Array, "K B E"]:
+def network_outputs(
+    networks: Networks, x: Float[Array, "K B I"], activation: Activation = RELU, means: int | None = None
+) -> Float[Array, "K B E"]:
     """What the networks say, each member to its own batch.
 
     The outputs after the first `means` (None: all) teach their own weights alone, not the layers before these.
     """
     *inner, (weights, biases) = networks
     for w, b in inner:
-        x = jax.nn.relu(layer_outputs(x, w, b))
+        x = activation(layer_outputs(x, w, b))
     if means in (None, biases.shape[-1]):
         return layer_outputs(x, weights, biases)
     expected = layer_outputs(x, weights[..., :means], biases[..., :means])

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int, Key
 
 from metrpo.config import FitConfig
 from metrpo.devices import AXIS, FIRST, WHOLE, spread
-from metrpo.model.ensemble import Ensemble, Networks, mean_and_spread, with_products
+from metrpo.model.ensemble import Activation, Ensemble, Networks, mean_and_spread, with_products
 from metrpo.types import Array, Normaliser, Transitions
 
 VALIDATION_CHUNK = 1000
@@ -35,6 +35,11 @@ class FitData(NamedTuple):
     normaliser: Normaliser
     train: Transitions
     validation: Transitions
+    activation: Activation
+
+    def ensemble(self, networks: Networks) -> Ensemble:
+        """Of networks that are being fitted."""
+        return Ensemble(networks, self.normaliser, activation=self.activation)
 
 
 class FitState(NamedTuple):
@@ -113,20 +118,19 @@ def _block(
     config: FitConfig,
 ) -> FitState:
     """One device's share of `train_and_validate`."""
-    normaliser, train, validation = data
     optimizer = optimizer_of(config)
     members = at.best_loss.shape[0]
     first = jax.lax.axis_index(AXIS) * members
     block_key = jax.random.fold_in(key, passes)
 
     def total_loss(networks: Networks, *batch: Float[Array, "K B _"]) -> tuple[Float[Array, ""], Float[Array, "K"]]:
-        ensemble = Ensemble(with_products(networks, config.products), normaliser)
+        ensemble = data.ensemble(with_products(networks, config.products))
         losses, surprise = losses_of(ensemble, config.loss_units, *batch)
         return jnp.sum(jnp.mean(losses + surprise, axis=-1)), jnp.mean(losses, axis=-1)
 
     def train_group(group: _Training, numbers: Int[Array, "K"], key: Key[Array, ""]) -> _Training:
-        index = minibatch(key, numbers, config.batch_size, train.size)
-        batch = (jnp.take(x, index, axis=0) for x in train[:3])
+        index = minibatch(key, numbers, config.batch_size, data.train.size)
+        batch = (jnp.take(x, index, axis=0) for x in data.train[:3])
         gradient, losses = jax.grad(total_loss, has_aux=True)(group.networks, *batch)
         change, optimizer_state = optimizer.update(gradient, group.optimizer, group.networks)
         return _Training(optax.apply_updates(group.networks, change), optimizer_state, losses)
@@ -140,7 +144,7 @@ def _block(
     apart = members if jax.default_backend() == "cpu" else 1
     groups = _split(_Training(at.networks, at.optimizer, at.train_loss), apart)
     networks, optimizer_state, train_loss = _joined(jax.lax.fori_loop(0, steps, step, groups))
-    loss = validation_loss(Ensemble(networks, normaliser), validation, config.loss_units)
+    loss = validation_loss(data.ensemble(networks), data.validation, config.loss_units)
     better = loss < at.best_loss  # False for NaN: a diverged member keeps its best weights
 
     def keep_best(new: Float[Array, "K *rest"], best: Float[Array, "K *rest"]) -> Float[Array, "K *rest"]:

@@ -17,7 +17,7 @@ from metrpo import devices
 from metrpo.config import FitConfig
 from metrpo.model.ensemble import Ensemble, Networks
 from metrpo.model.epochs import FitData, FitState, optimizer_of, train_and_validate, validation_loss
-from metrpo.types import Array, Normaliser, Transitions
+from metrpo.types import Array, Transitions
 
 
 class FitInfo(NamedTuple):
@@ -40,15 +40,14 @@ class FitInfo(NamedTuple):
 
 
 def fit(
-    networks: Networks,
-    normaliser: Normaliser,
+    ensemble: Ensemble,
     train: Transitions,
     validation: Transitions,
     config: FitConfig,
     key: Key[Array, ""],
     on_validation: Callable[[int, Float[Array, "K"]], None] = lambda passes, losses: None,
 ) -> tuple[Ensemble, FitInfo]:
-    """The ensemble fitted to `train`, each member at its own best validation loss.
+    """The ensemble fitted to `train` from the weights it has, each member at its own best validation loss.
 
     Stops when no member has improved for `config.patience` passes, at the latest after `config.max_passes` or
     `config.max_steps`.
@@ -56,11 +55,12 @@ def fit(
     JAX's devices where their number allows, as the paper suggests (appendix "Real-time complexity").
     """
     optimizer = optimizer_of(config)
-    loss = validation_loss(Ensemble(networks, normaliser), validation, config.loss_units)
+    networks, data = ensemble.networks, FitData(ensemble.normaliser, train, validation, ensemble.activation)
+    loss = validation_loss(data.ensemble(networks), validation, config.loss_units)
     at = FitState(networks, optimizer.init(networks), networks, loss, jnp.zeros(loss.shape, jnp.int32), loss)
     at = jax.tree.map(jnp.copy, at)  # its buffers are given away below, the caller's are not
     mesh = devices.mesh(loss.size)
-    at, data = devices.shared(at, mesh), devices.copied(FitData(normaliser, train, validation), mesh)
+    at, data = devices.shared(at, mesh), devices.copied(data, mesh)
     # At least one step a pass: the first iterations of a small task may have fewer transitions than a minibatch.
     steps_per_pass = max(1, int(train.size) // config.batch_size)
     most = config.max_passes * steps_per_pass
@@ -76,7 +76,7 @@ def fit(
     diverged = ~(_finite(at.networks) & np.isfinite(at.train_loss))
     lost = ~(_finite(at.best_networks) & np.isfinite(at.best_loss)) | (diverged & (np.asarray(at.best_pass) == 0))
     info = FitInfo(passes, at.best_loss, at.train_loss, at.best_pass, diverged, lost)
-    return Ensemble(at.best_networks, data.normaliser), info
+    return ensemble._replace(networks=at.best_networks, normaliser=data.normaliser), info
 
 
 def refit(
@@ -101,7 +101,8 @@ def refit(
 
     normaliser = jax.tree.map(np.asarray, ensemble.normaliser)
     chosen = jax.tree.map(lambda x: np.asarray(x)[lost], fresh)
-    again, second = fit(chosen, normaliser, train, validation, config, key)
+    start = ensemble._replace(networks=chosen, normaliser=normaliser)
+    again, second = fit(start, train, validation, config, key)
     networks = jax.tree.map(lambda old, new: jnp.asarray(put(old, new)), ensemble.networks, again.networks)
     merged = FitInfo(
         passes=info.passes + second.passes,
@@ -112,7 +113,7 @@ def refit(
         lost=put(info.lost, second.lost),
         resets=len(lost),
     )
-    return Ensemble(networks, ensemble.normaliser), merged
+    return ensemble._replace(networks=networks), merged
 
 
 def _finite(networks: Networks) -> Bool[np.ndarray, "K"]:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from metrpo.devices import AXIS, part_of
-from metrpo.model.ensemble import Carried, Ensemble, Networks, layer_outputs, network_outputs
+from metrpo.model.ensemble import RELU, Activation, Carried, Ensemble, Networks, layer_outputs, network_outputs
 from metrpo.types import Array, Normaliser
 
 _UNITS, _INPUTS = 2, 1
@@ -33,6 +33,7 @@ class SharedEnsemble(NamedTuple):
     """The members that remain; of every second hidden layer, this device's units."""
     normaliser: Normaliser
     carried: Carried = Carried()
+    activation: Activation = RELU
 
     @property
     def members(self) -> int:
@@ -47,7 +48,7 @@ class SharedEnsemble(NamedTuple):
         outputs = jnp.zeros((*x.shape[:2], self.own[-1][1].shape[-1]))
         if own:
             first = own * jax.lax.axis_index(AXIS)
-            mine = network_outputs(self.own, jax.lax.dynamic_slice_in_dim(x, first, own))
+            mine = network_outputs(self.own, jax.lax.dynamic_slice_in_dim(x, first, own), self.activation)
             outputs = jax.lax.dynamic_update_slice_in_dim(outputs, mine, first, 0)
         if remaining:
             outputs = outputs.at[-remaining:].set(self._summands(x[-remaining:]))
@@ -63,7 +64,7 @@ class SharedEnsemble(NamedTuple):
             if layer > 0:
                 if _cut_along(layer - 1, self.cut) == _INPUTS:
                     x = jax.lax.psum(x, AXIS)
-                x = jax.nn.relu(x)
+                x = self.activation(x)
             x = layer_outputs(x, weights, biases)
         return x
 
@@ -88,7 +89,7 @@ def shared(ensemble: Ensemble) -> SharedEnsemble:
             biases = part_of(biases, _UNITS) if along == _UNITS else jnp.where(this == 0, biases, 0.0)
         cut.append((weights, biases))
     mine = jax.tree.map(lambda x: jax.lax.dynamic_slice_in_dim(x, this * own, own), ensemble.networks)
-    return SharedEnsemble(mine, tuple(cut), ensemble.normaliser, ensemble.carried)
+    return SharedEnsemble(mine, tuple(cut), ensemble.normaliser, ensemble.carried, ensemble.activation)
 
 
 def _cut_along(layer: int, networks: Networks) -> int | None:

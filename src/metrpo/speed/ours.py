@@ -167,7 +167,7 @@ def _fit(width: str, products: str) -> Work:
             losses.block_until_ready()
             stamps.append(time.perf_counter())
 
-        fit(ensemble.networks, ensemble.normaliser, train, validation, config, jax.random.key(0), stamp)
+        fit(ensemble, train, validation, config, jax.random.key(0), stamp)
         return (stamps[1] - stamps[0]) / (passes * FIT_STEPS)
 
     steps()

@@ -11,7 +11,7 @@ from metrpo.config import Config
 from metrpo.console.progress import Progress
 from metrpo.errors import DivergedError
 from metrpo.model import ensemble as ensembles
-from metrpo.model.ensemble import Carried, Ensemble, Networks
+from metrpo.model.ensemble import Activation, Carried, Ensemble, Networks
 from metrpo.model.fit import FitInfo, fit, refit
 from metrpo.seeds import Stage, key_of
 from metrpo.types import Array
@@ -35,13 +35,14 @@ def fit_ensemble(
         networks = fresh_networks(config, task, init_key)
     e = config.ensemble
     normaliser = ensembles.normaliser_of(dataset.train, e.std_floor, e.delta_std_floor, task.unseen)
+    ensemble = Ensemble(networks, normaliser, Carried(task.carried), Activation(e.activation))
     train = jax.device_put(datasets.with_capacity(dataset.train, config.collect.max_train))
     validation = jax.device_put(datasets.with_capacity(dataset.validation, config.collect.max_validation))
 
     def tell(passes: int, losses: Array) -> None:
         progress.update(passes, f"validation loss {float(np.mean(losses)):.4g}")
 
-    ensemble, info = fit(networks, normaliser, train, validation, config.fit, fit_key, tell)
+    ensemble, info = fit(ensemble, train, validation, config.fit, fit_key, tell)
     if (survived := info.diverged & ~info.lost).any():
         _log.warning("fit, iteration %d: %s diverged and kept their best weights", iteration, _named(survived))
     if info.lost.any():
@@ -56,7 +57,7 @@ def fit_ensemble(
             f"start anew with fit.learning_rate below {config.fit.learning_rate}, or look for outliers in the data "
             f"(largest change of a state: {largest:.3g})"
         )
-    return ensemble._replace(carried=Carried(task.carried)), info
+    return ensemble, info
 
 
 def _named(members: np.ndarray) -> str:
