@@ -45,11 +45,11 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.fixture(scope="module")
 def plain_curve() -> Iterator[None]:
     """`curve.png` is a text: drawn, it takes half a second of every iteration."""
-    from metrpo.run import directory
+    from metrpo.run import derived_files
     from metrpo.run.files import atomic_write
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(directory, "draw_curve", lambda rows, path, *_: atomic_write(path, f"{len(rows)} rows"))
+        patch.setattr(derived_files, "draw_curve", lambda rows, path, *_: atomic_write(path, f"{len(rows)} rows"))
         yield
 
 

@@ -17,7 +17,7 @@ from metrpo.errors import ConfigError
 from metrpo.policy import squashed
 from metrpo.policy.inputs import normalised
 from metrpo.presets import override, preset
-from metrpo.run import directory
+from metrpo.run import derived_files, directory
 from metrpo.run.files import atomic_write
 from metrpo.run.metrics import read_metrics
 from metrpo.run.policy_export import export
@@ -59,7 +59,7 @@ SMALL = override(
 @pytest.fixture(scope="module", autouse=True)
 def _probe_is_a_task():
     with probe.registered(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(directory, "draw_curve", lambda rows, path, *_: atomic_write(path, "drawn"))
+        patch.setattr(derived_files, "draw_curve", lambda rows, path, *_: atomic_write(path, "drawn"))
         yield
 
 

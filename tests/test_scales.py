@@ -23,7 +23,7 @@ from metrpo.model.ensemble import Ensemble
 from metrpo.model.fit import FitInfo
 from metrpo.policy_phase import PhaseInfo
 from metrpo.presets import override, preset
-from metrpo.run import directory as directories
+from metrpo.run import derived_files
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.files import read_arrays, write_arrays
@@ -265,7 +265,7 @@ def learn_at_once(monkeypatch):
 def test_a_run_with_an_offset_resumes_byte_for_byte(tmp_path, known, monkeypatch, learns):
     if not learns:
         learn_at_once(monkeypatch)
-    monkeypatch.setattr(directories, "draw_curve", lambda *_: None)
+    monkeypatch.setattr(derived_files, "draw_curve", lambda *_: None)
     said, task = [], known(seen(1, 1e8))
     monkeypatch.setattr(scales, "warn", lambda config, task, *_: said.append(task.name))
     config = override(dataclasses.replace(preset(task.name), iterations=2), probe.BRIEF)

@@ -25,8 +25,9 @@ from metrpo.errors import ConfigError, MetrpoError
 from metrpo.finite import require_finite
 from metrpo.limits import NONE, Limits
 from metrpo.run import task_file
-from metrpo.run.directory import RunDirectory, Saved
+from metrpo.run.directory import RunDirectory
 from metrpo.run.memory import require_memory
+from metrpo.run.newest_checkpoint import Saved
 from metrpo.run.yardstick_record import are_kept, keep
 from metrpo.seeds import Stage, rng_of
 from metrpo.stages.log import Unkept

@@ -22,7 +22,7 @@ from metrpo.console.progress import Progress
 from metrpo.errors import MetrpoError
 from metrpo.policy import gaussian
 from metrpo.presets import override
-from metrpo.run import directory
+from metrpo.run import derived_files
 from metrpo.run.checkpoint import load_state, save_state
 from metrpo.run.curve import draw_curve
 from metrpo.run.policy_file import Learned, load_policy, save_policy
@@ -129,7 +129,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(runs, method, tmp_path):
 
 @METHODS
 def test_a_stopped_run_directory_is_resumed_exactly(runs, method, tmp_path, monkeypatch):
-    monkeypatch.setattr(directory, "draw_curve", lambda *_: None)
+    monkeypatch.setattr(derived_files, "draw_curve", lambda *_: None)
     config = override(TINY, {"method": method, "deterministic": True, "iterations": 2})
     whole = training.train(config, tmp_path / "whole")
     training.train(override(config, {"iterations": 1}), tmp_path / "parts")

@@ -24,7 +24,7 @@ from metrpo.commands.parse import parse
 from metrpo.config import Config
 from metrpo.launch.run_spec import RunSpec
 from metrpo.presets import preset
-from metrpo.run import directory, installation, machine, video
+from metrpo.run import derived_files, installation, machine, video
 from metrpo.run.directory import RunDirectory
 from metrpo.run.policy_file import load_policy
 from metrpo.run.video import VideoError
@@ -67,7 +67,7 @@ def _stubs(monkeypatch, tmp_path):
     stub = types.ModuleType("metrpo.training")
     stub.train = train  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "metrpo.training", stub)
-    monkeypatch.setattr(directory, "draw_curve", lambda rows, path, title, *_: None)
+    monkeypatch.setattr(derived_files, "draw_curve", lambda rows, path, title, *_: None)
     monkeypatch.setattr("metrpo.evaluation.record", lambda make_env, policy, path, seed: path)
     monkeypatch.chdir(tmp_path)
     handler = signal.getsignal(signal.SIGTERM)

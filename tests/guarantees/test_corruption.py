@@ -22,7 +22,7 @@ import probe
 from metrpo import training
 from metrpo.errors import MetrpoError
 from metrpo.presets import override, preset
-from metrpo.run import directory as directories
+from metrpo.run import derived_files
 from metrpo.run.directory import RunDirectory, stored_config
 from metrpo.run.episodes import append_episode
 
@@ -57,7 +57,7 @@ class Real(NamedTuple):
 def _quick():
     """The probe is a task, pictures are quick to draw, and nothing waits for the disk."""
     with probe.registered(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(directories, "draw_curve", lambda rows, path, *_: path.write_text(f"{len(rows)} iterations"))
+        patch.setattr(derived_files, "draw_curve", lambda rows, path, *_: path.write_text(f"{len(rows)} iterations"))
         patch.setattr(os, "fsync", lambda _: None)
         yield
 

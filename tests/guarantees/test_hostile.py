@@ -35,7 +35,7 @@ from metrpo.config import Config
 from metrpo.errors import ConfigError, MetrpoError, RunDirectoryError, TaskError
 from metrpo.history import History
 from metrpo.presets import override
-from metrpo.run import directory, lock
+from metrpo.run import lock, newest_checkpoint
 from metrpo.run.checkpoint import load_state
 from metrpo.run.directory import RunDirectory, stored_config
 from metrpo.run.episodes import EpisodeLog
@@ -71,8 +71,8 @@ class Loader(NamedTuple):
 
 def _load_checkpoint(path):
     state, meta = load_state(path, _load_checkpoint.template)
-    directory._check(path, state, meta)
-    return state, directory._config(path, meta)
+    newest_checkpoint.require_consistent(path, state, meta)
+    return state, newest_checkpoint.config_of(path, meta)
 
 
 def _load_episode(path):
@@ -779,7 +779,7 @@ def test_checkpoints_are_in_the_order_of_their_numbers(tmp_path, sound):
         for number in (99_999, 100_000, 9):
             (tmp_path / "checkpoints").mkdir(exist_ok=True)
             (tmp_path / "checkpoints" / f"iteration-{number:05d}.npz").write_bytes(b"")
-        assert [int(path.stem[10:]) for path in run._checkpoints()] == [9, 99_999, 100_000]
+        assert [int(path.stem[10:]) for path in newest_checkpoint.checkpoints(run.path)] == [9, 99_999, 100_000]
 
 
 @pytest.mark.parametrize("name", ["000000000.npz", "٠٠٠٠٠٠٠٠.npz", "9" * 30 + ".npz"])

@@ -18,8 +18,8 @@ import probe
 from metrpo import external, training
 from metrpo.errors import RunDirectoryError
 from metrpo.presets import override, preset
+from metrpo.run import derived_files, files
 from metrpo.run import directory as directories
-from metrpo.run import files
 from metrpo.run.directory import stored_config
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.files import DamagedFile, read_arrays, write_arrays
@@ -54,7 +54,7 @@ CONFIG = override(dataclasses.replace(SWIMMER, task="Probe", iterations=2), prob
 
 @pytest.fixture(autouse=True)
 def _probe_is_a_task(monkeypatch):
-    monkeypatch.setattr(directories, "draw_curve", lambda *_: None)
+    monkeypatch.setattr(derived_files, "draw_curve", lambda *_: None)
     with probe.registered():
         yield
 

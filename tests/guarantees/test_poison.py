@@ -27,7 +27,7 @@ from metrpo.policy.stopping import RULES, Evidence
 from metrpo.policy.value import linear
 from metrpo.policy.value.value_table import init_baseline
 from metrpo.presets import override
-from metrpo.run import directory
+from metrpo.run import derived_files
 from metrpo.run.clock import Clock
 from metrpo.run.metrics import completed, read_metrics
 from metrpo.stages import ensemble_fit, policy_search, records
@@ -61,7 +61,7 @@ TINY = override(
 def _probe_is_a_task():
     with probe.registered(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(training, "_measure_yardsticks", lambda *_: None)  # they play as well
-        patch.setattr(directory, "draw_curve", lambda rows, path, title, *_: path.write_text(f"{len(rows)} rows"))
+        patch.setattr(derived_files, "draw_curve", lambda rows, path, title, *_: path.write_text(f"{len(rows)} rows"))
         yield
 
 

@@ -17,7 +17,7 @@ import tiny_run
 from metrpo.commands import main
 from metrpo.console import progress
 from metrpo.console.progress import Progress, TolerantProgress
-from metrpo.run import directory
+from metrpo.run import derived_files
 from metrpo.run.metrics import Events, read_metrics
 from tiny_run import CONFIG, ITERATIONS, command_line, differing, process_line, result, train
 
@@ -62,8 +62,8 @@ def hangs(*_):
 @pytest.mark.parametrize(
     ("owner", "name", "what", "costs"),
     [
-        (directory, "draw_curve", "learning curve", ["curve.png"]),
-        (directory, "Events", "TensorBoard events", []),
+        (derived_files, "draw_curve", "learning curve", ["curve.png"]),
+        (derived_files, "Events", "TensorBoard events", []),
         (Events, "add", "TensorBoard events", []),
         (Events, "_write", "TensorBoard events", []),
     ],
@@ -71,7 +71,7 @@ def hangs(*_):
 )
 @pytest.mark.parametrize("breaks", [raises, hangs])
 def test_what_breaks_costs_only_itself(owner, name, what, costs, breaks, tmp_path, expected, monkeypatch, caplog):
-    monkeypatch.setattr(directory, "_PATIENCE", 0.2)
+    monkeypatch.setattr(derived_files, "_PATIENCE", 0.2)
     before = time.monotonic()
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, breaks)
@@ -87,20 +87,20 @@ def test_what_breaks_costs_only_itself(owner, name, what, costs, breaks, tmp_pat
 
 def test_what_takes_long_but_ends_is_waited_for(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        directory, "draw_curve", lambda rows, path, title, *_: (time.sleep(0.3), path.write_text("done"))
+        derived_files, "draw_curve", lambda rows, path, title, *_: (time.sleep(0.3), path.write_text("done"))
     )
     train(CONFIG, tmp_path)
     assert (tmp_path / "curve.png").read_text() == "done"
 
 
 def test_tensorboards_directory_may_go_at_any_time(tmp_path, expected, monkeypatch, caplog):
-    draw = directory.draw_curve
+    draw = derived_files.draw_curve
 
     def sweeping(rows, path, title, yardsticks):
         shutil.rmtree(tmp_path / "events", ignore_errors=True)
         draw(rows, path, title, yardsticks)
 
-    monkeypatch.setattr(directory, "draw_curve", sweeping)
+    monkeypatch.setattr(derived_files, "draw_curve", sweeping)
     train(CONFIG, tmp_path)
     assert differing(result(tmp_path), expected) == []
     assert steps_shown(tmp_path) == ALL_STEPS, "it comes back whole"

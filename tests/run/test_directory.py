@@ -17,6 +17,7 @@ from metrpo import algorithm, training
 from metrpo.config import TRPOConfig, to_json
 from metrpo.console.progress import Progress
 from metrpo.errors import RunDirectoryError
+from metrpo.run import derived_files
 from metrpo.run import directory as module
 from metrpo.run.directory import RunDirectory
 from metrpo.run.metrics import read_metrics
@@ -38,7 +39,7 @@ def stable(path: Path) -> dict[str, bytes]:
 @pytest.fixture(autouse=True)
 def _no_pictures(monkeypatch):
     # The learning curve costs a second each; test_report draws it.
-    monkeypatch.setattr(module, "draw_curve", lambda rows, path, title, *_: None)
+    monkeypatch.setattr(derived_files, "draw_curve", lambda rows, path, title, *_: None)
 
 
 def test_the_rows_are_published_last(tmp_path, monkeypatch):
@@ -50,7 +51,7 @@ def test_the_rows_are_published_last(tmp_path, monkeypatch):
         published = len(read_metrics(metrics)) if metrics.exists() else 0
         seen.append((len(rows), published, load_policy(path.parent).info.iteration))
 
-    monkeypatch.setattr(module, "draw_curve", look)
+    monkeypatch.setattr(derived_files, "draw_curve", look)
     train(tmp_path / "run", until=3)
     assert seen == [(1, 0, 1), (2, 1, 2), (3, 2, 3)]
 
@@ -124,8 +125,8 @@ warnings.simplefilter("ignore")  # JAX warns of forks; it has not started its th
 sys.path.insert(0, sys.argv[1])
 import tensorboardX  # once, not in every child
 import blank_run
-from metrpo.run import directory
-directory.draw_curve = lambda rows, path, title, *_: None
+from metrpo.run import derived_files
+derived_files.draw_curve = lambda rows, path, title, *_: None
 calls, real = 0, {name: getattr(os, name) for name in ("replace", "fsync", "unlink")}
 def deadly(name):
     def call(*arguments, **named):
@@ -270,7 +271,7 @@ def test_training_says_where_a_run_is_taken_up(tmp_path, monkeypatch, budget, ex
 
 
 def test_a_finished_run_rewrites_what_is_missing_or_damaged(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "draw_curve", lambda rows, path, *_: path.write_text(f"{len(rows)} rows"))
+    monkeypatch.setattr(derived_files, "draw_curve", lambda rows, path, *_: path.write_text(f"{len(rows)} rows"))
     train(tmp_path, until=2)
 
     def contents():
@@ -287,10 +288,10 @@ def test_a_finished_run_rewrites_what_is_missing_or_damaged(tmp_path, monkeypatc
 
 def test_a_curve_from_before_the_checkpoint_is_drawn_anew(tmp_path, monkeypatch):
     """It could not be drawn then, though all else was written."""
-    monkeypatch.setattr(module, "draw_curve", lambda rows, path, *_: path.write_text(f"{len(rows)} rows"))
+    monkeypatch.setattr(derived_files, "draw_curve", lambda rows, path, *_: path.write_text(f"{len(rows)} rows"))
     train(tmp_path, until=1)
     with monkeypatch.context() as patch:
-        patch.setattr(module, "draw_curve", lambda *_: 1 / 0)
+        patch.setattr(derived_files, "draw_curve", lambda *_: 1 / 0)
         train(tmp_path, until=2)
     assert (tmp_path / "curve.png").read_text() == "1 rows"
     train(tmp_path, until=2)
@@ -422,7 +423,7 @@ def test_a_broken_picture_costs_one_warning(tmp_path, monkeypatch, caplog):
     def broken(*_: Any) -> None:
         raise RuntimeError("no fonts")
 
-    monkeypatch.setattr(module, "draw_curve", broken)
+    monkeypatch.setattr(derived_files, "draw_curve", broken)
     with caplog.at_level(logging.WARNING, "metrpo"):
         assert train(tmp_path, until=3) == [1, 2, 3]
     assert [r.getMessage() for r in caplog.records] == [

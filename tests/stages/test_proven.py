@@ -20,7 +20,7 @@ from metrpo.config import Config
 from metrpo.errors import EpisodeError
 from metrpo.policy import gaussian
 from metrpo.presets import override, preset
-from metrpo.run import directory, machine
+from metrpo.run import derived_files, machine
 from metrpo.run.directory import RunDirectory
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.files import atomic_write
@@ -153,7 +153,7 @@ def test_the_run_goes_back_from_a_policy_that_earns_less(two, monkeypatch):
 @pytest.fixture
 def quick(monkeypatch):
     """No curve, and the machine as it is."""
-    monkeypatch.setattr(directory, "draw_curve", lambda rows, path, *_: atomic_write(path, f"{len(rows)} rows"))
+    monkeypatch.setattr(derived_files, "draw_curve", lambda rows, path, *_: atomic_write(path, f"{len(rows)} rows"))
     monkeypatch.setattr(machine, "prepare", lambda *_, **__: None)
 
 

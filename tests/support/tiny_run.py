@@ -14,7 +14,7 @@ from faults import Disk
 from metrpo import algorithm, external
 from metrpo.commands.parse import parse
 from metrpo.errors import RunDirectoryError
-from metrpo.run import directory, lock, machine
+from metrpo.run import derived_files, lock, machine
 from metrpo.run.episodes import EpisodeLog
 from metrpo.run.files import atomic_write
 from metrpo.training import train
@@ -99,7 +99,9 @@ def cheap():
         patch.setattr(EpisodeLog, "append", counted_append)
         patch.setattr(lock, "source_commit", lambda: "a commit")
         patch.setattr(machine, "prepare", lambda *_, **__: None)
-        patch.setattr(directory, "draw_curve", lambda rows, path, title, *_: atomic_write(path, f"{len(rows)} rows"))
+        patch.setattr(
+            derived_files, "draw_curve", lambda rows, path, title, *_: atomic_write(path, f"{len(rows)} rows")
+        )
         yield
 
 
