@@ -4,21 +4,11 @@ import io
 import re
 import sys
 import time
-from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from metrpo.console.progress import (
-    SILENT,
-    LiveProgress,
-    PlainProgress,
-    TolerantProgress,
-    default_progress,
-    duration,
-    outcome,
-    summary,
-)
+from metrpo.console.progress import SILENT, LiveProgress, PlainProgress, TolerantProgress, default_progress
 
 ROW = {
     "iteration": 1,
@@ -64,20 +54,6 @@ def test_a_resumed_run_says_so(iteration, of, said):
     ):
         progress.resume("runs/[a]", iteration, of, 12_000, 600 if iteration == 1 else 0)
     assert out.getvalue().splitlines() == [said] * 3
-
-
-def test_a_runs_return_is_shown_even_where_evaluation_failed():
-    nothing = ROW | {"return_real": float("nan"), "return_collected": 4.0}
-    run_dir = Path("a dir")
-    assert outcome(ROW, run_dir) == "return 12.3 ± 0.5 after 3,000 real steps"
-    assert outcome(nothing | {"failed_evaluation": 0}, run_dir) == "collected 4.0 after 3,000 real steps"
-    failed = outcome(nothing | {"failed_evaluation": 1}, run_dir)
-    assert failed.startswith("no return after 3,000 real steps: the last evaluation failed")
-    assert failed.endswith("metrpo evaluate 'a dir'")
-    assert "nan" not in failed
-    assert "evaluation failed, collected     4.0" in summary(nothing | {"failed_evaluation": 1})
-    baseline = {name: value for name, value in nothing.items() if name != "return_imagined"}
-    assert outcome(baseline, run_dir).startswith("no return"), "it has an environment"
 
 
 def test_plain_lines_are_one_per_stage_and_one_per_iteration():
@@ -144,11 +120,3 @@ def test_silence(capsys):
 def test_the_display_fits_the_output(monkeypatch, terminal, kind):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: terminal, raising=False)
     assert type(default_progress()) is kind
-
-
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [(0.4, "0 s"), (59.4, "59 s"), (59.6, "1 min 00 s"), (3599, "59 min 59 s"), (7800, "2 h 10 min")],
-)
-def test_durations(seconds, text):
-    assert duration(seconds) == text

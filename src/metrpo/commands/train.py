@@ -72,7 +72,7 @@ def _is_complete(run_dir: Path, config: Config) -> bool:
 
 def say_outcome(run_dir: Path, video: bool) -> None:
     """Prints the run's return and its files. Where no video can be made, prints why."""
-    from metrpo.console.progress import outcome
+    from metrpo.console.result_lines import outcome
     from metrpo.evaluation import render
     from metrpo.run.metrics import read_metrics
     from metrpo.run.video import VideoError

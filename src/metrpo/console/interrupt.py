@@ -12,7 +12,8 @@ import time
 from types import FrameType
 from typing import Any, Self
 
-from metrpo.console.progress import Measured, Progress, TolerantProgress
+from metrpo.console.progress import Progress, TolerantProgress
+from metrpo.console.result_lines import Measured
 
 PATIENCE = 5.0
 """Seconds that an episode has to end after a signal."""

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from metrpo import budget
 from metrpo.checks.health import examine
-from metrpo.console.progress import duration
+from metrpo.console.result_lines import duration
 from metrpo.run.episodes import waiting_steps
 from metrpo.run.find import FoundRuns, SeenRun, find, is_finished, told_apart
 from metrpo.run.metrics import numbers

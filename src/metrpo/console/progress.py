@@ -5,23 +5,19 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import logging
-import math
 import os
-import shlex
 import sys
 import time
-from collections.abc import Callable, Mapping
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TextIO
 
-from metrpo.counting import counted
+from metrpo.console.result_lines import Measured, heading, resuming, rounded, summary, time_left
 
 if TYPE_CHECKING:
     from rich import progress as rich_progress
     from rich.console import Console
 
 _log = logging.getLogger("metrpo")
-Measured = Mapping[str, Any]
 
 
 class Progress:
@@ -32,7 +28,7 @@ class Progress:
 
     def resume(self, where: str, iteration: int, of: int | None, real_steps: int, waiting: int = 0) -> None:
         """A run resumes: `iteration` of `of` comes next, after `real_steps` and `waiting` new ones."""
-        self.say(_resuming(where, iteration, of, real_steps, waiting))
+        self.say(resuming(where, iteration, of, real_steps, waiting))
 
     def begin(self, iteration: int, of: int | None) -> None:
         """Outer iteration `iteration` (from 1) of `of` (None: unknown) begins."""
@@ -69,7 +65,7 @@ class PlainProgress(Progress):
 
     def begin(self, iteration: int, of: int | None) -> None:
         """Remembers the iteration; its stages name it."""
-        self._heading, self._began = _heading(iteration, of), time.monotonic()
+        self._heading, self._began = heading(iteration, of), time.monotonic()
 
     def stage(self, name: str, total: int | None = None) -> None:
         """Prints the stage's name."""
@@ -77,7 +73,7 @@ class PlainProgress(Progress):
 
     def end(self, row: Measured, seconds_left: float | None = None) -> None:
         """Prints the iteration's results."""
-        self._print(f"{self._heading}  {summary(row)}{_left(seconds_left)}")
+        self._print(f"{self._heading}  {summary(row)}{time_left(seconds_left)}")
 
     def _print(self, line: str) -> None:
         print(line, file=self._out, flush=True)
@@ -110,7 +106,7 @@ class LiveProgress(Progress):
 
     def begin(self, iteration: int, of: int | None) -> None:
         """Starts the display with the iteration's number."""
-        self._heading = _heading(iteration, of)
+        self._heading = heading(iteration, of)
         self._bars.start()
 
     def stage(self, name: str, total: int | None = None) -> None:
@@ -127,7 +123,7 @@ class LiveProgress(Progress):
         """Leaves a line with the iteration's results above the bar."""
         self._clear()
         self._bars.console.print(f"[bold]{self._heading}[/]  {summary(row)}", highlight=False, soft_wrap=True)
-        self._last = f"last return {_number(row.get('return_real'))}{_left(seconds_left)}"
+        self._last = f"last return {rounded(row.get('return_real'))}{time_left(seconds_left)}"
 
     def close(self) -> None:
         """Takes the display down; lines of finished iterations stay."""
@@ -216,79 +212,3 @@ def _is_notebook() -> bool:
     """Whether this is Jupyter, Colab or the like, rather than IPython on a terminal."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return type(shell).__name__ not in ("NoneType", "TerminalInteractiveShell")
-
-
-def summary(row: Measured) -> str:
-    """The main metrics of an iteration in one line."""
-    parts = [
-        f"{row.get('real_steps', 0):>7,} real steps",
-        f"return {_number(row.get('return_real')):>7} ± {_number(row.get('return_real_std'))}",
-    ]
-    if _is_missing(row.get("return_real")):
-        parts[1] = f"collected {_number(row.get('return_collected')):>7}"
-        if row.get("failed_evaluation"):  # else only another program plays
-            parts[1] = f"evaluation failed, {parts[1]}"
-    if "return_imagined" in row:
-        parts.append(f"imagined {_number(row['return_imagined']):>7}")
-    seconds = sum(v for name, v in row.items() if name.startswith("seconds_") and v is not None)
-    return "  ".join([*parts, duration(seconds)] if seconds else parts)
-
-
-def outcome(row: Measured, run_dir: Path) -> str:
-    """The result of a run in one line, from its last iteration."""
-    after = f"after {row['real_steps']:,} real steps"
-    if not _is_missing(row.get("return_real")):
-        return f"return {_number(row['return_real'])} ± {_number(row.get('return_real_std'))} {after}"
-    if _has_no_environment(row):
-        return f"collected {_number(row.get('return_collected'))} {after}"
-    return (
-        f"no return {after}: the last evaluation failed, as the warning above says; "
-        f"to see where: metrpo evaluate {shlex.quote(str(run_dir))}"
-    )
-
-
-def _has_no_environment(row: Measured) -> bool:
-    """Whether only another program plays."""
-    return not row.get("failed_evaluation") and "return_imagined" in row
-
-
-def earned(row: Measured) -> str:
-    """The real return of an iteration, or the collected one where only another program plays."""
-    if _is_missing(row.get("return_real")):
-        return f"collected {_number(row.get('return_collected'))}"
-    return f"return {_number(row.get('return_real'))}"
-
-
-def _is_missing(value: float | None) -> bool:
-    return value is None or math.isnan(value)
-
-
-def duration(seconds: float) -> str:
-    """Seconds for people: "42 s", "3 min 05 s", "2 h 10 min"."""
-    whole = round(seconds)
-    if whole < 60:
-        return f"{whole} s"
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
-
-
-def _resuming(where: str, iteration: int, of: int | None, real_steps: int, waiting: int) -> str:
-    steps = counted(real_steps, "real step")
-    if of is not None and iteration > of:
-        return f"{where} is finished: {counted(of, 'iteration')}, {steps}; raise the budget to continue it"
-    budget = "" if of is None else f" of {of}"
-    collected = f" and {waiting:,} new ones" if waiting else ""
-    return f"resuming {where} at iteration {iteration}{budget}, {steps}{collected}"
-
-
-def _heading(iteration: int, of: int | None) -> str:
-    return f"iteration {iteration}" + (f"/{of}" if of is not None else "")
-
-
-def _left(seconds: float | None) -> str:
-    return "" if not seconds else f"   about {duration(seconds)} left"
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}"

@@ -10,7 +10,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from metrpo.console.progress import duration
+from metrpo.console.result_lines import duration
 from metrpo.counting import counted
 from metrpo.errors import MetrpoError
 from metrpo.launch.backend import Means

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from metrpo import budget
-from metrpo.console.progress import duration, earned
+from metrpo.console.result_lines import duration, earned
 from metrpo.launch.run_spec import RunSpec
 from metrpo.run.metrics import Row, read_metrics
 

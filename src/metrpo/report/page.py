@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from metrpo.checks.health import examine
-from metrpo.console.progress import duration
+from metrpo.console.result_lines import duration
 from metrpo.counting import counted
 from metrpo.report import charts
 from metrpo.report.charts import number

@@ -11,7 +11,7 @@ from statistics import fmean
 from typing import TYPE_CHECKING
 
 from metrpo.console.live_table import is_running
-from metrpo.console.progress import duration
+from metrpo.console.result_lines import duration
 from metrpo.counting import counted
 from metrpo.errors import MetrpoError
 from metrpo.launch.local import shares_of_cores

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from metrpo.console.interrupt import stop
-from metrpo.console.progress import duration
+from metrpo.console.result_lines import duration
 from metrpo.counting import counted
 from metrpo.errors import MetrpoError
 from metrpo.launch.backend import Means
