@@ -1,14 +1,11 @@
 """metrpo watch and metrpo plot."""
 
 import dataclasses
-import fcntl
 import io
 import itertools
 import json
-import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,10 +17,12 @@ from rich.console import Console
 from metrpo.commands.main import main
 from metrpo.config import Config, EnsembleConfig
 from metrpo.console import live_table as watching
-from metrpo.console.live_table import SPARKS, is_running, sparkline, standing, watch
+from metrpo.console.live_table import SPARKS, sparkline, watch
+from metrpo.console.run_status import status_of
 from metrpo.plots.bands import curve
 from metrpo.policy.gaussian import Policy
 from metrpo.run.directory import RunDirectory
+from metrpo.run.episodes import waiting_steps
 from metrpo.run.find import find, group, read
 from metrpo.run.lock import claim
 from metrpo.types import Episode
@@ -105,16 +104,16 @@ def test_steps_that_wait_are_seen(tmp_path):
         run.load(State(0, 0, LAYERS))
         run.episodes.append(an_episode(30))
         run.episodes.append(an_episode(12))
-        assert watching.waiting_steps(tmp_path / "a") == 42
+        assert waiting_steps(tmp_path / "a") == 42
         run.episodes.pending()
         run.save(State(1, 42, LAYERS), {"iteration": 1, "real_steps": 42, "return_real": 1.0})
         assert (tmp_path / "a" / "episodes" / "00000001.npz").exists(), "kept for the checkpoint before"
-        assert watching.waiting_steps(tmp_path / "a") == 0
+        assert waiting_steps(tmp_path / "a") == 0
         run.episodes.append(an_episode(1500))
-        assert standing(read(tmp_path / "a")).waiting_steps == 1500
+        assert status_of(read(tmp_path / "a")).waiting_steps == 1500
         assert "42 +1,500" in printed([tmp_path / "a"])
         (tmp_path / "a" / "episodes" / "00000002.npz").write_bytes(b"torn")
-        assert standing(read(tmp_path / "a")).waiting_steps == 0
+        assert status_of(read(tmp_path / "a")).waiting_steps == 0
 
 
 class State(NamedTuple):
@@ -128,12 +127,6 @@ LAYERS = Policy(((np.zeros((10, 2), np.float32), np.zeros(2, np.float32)),), np.
 
 def an_episode(length):
     return Episode(np.zeros((length + 1, 10)), np.zeros((length, 2), "f"), np.zeros(length, "f"), False)
-
-
-def test_the_time_left_does_not_count_the_compilation(tmp_path):
-    rows = [r | {"wall_seconds": 60.0 + 2.0 * r["iteration"]} for r in healthy(2)]
-    assert standing(read(a_run(tmp_path / "a", CONFIG, rows))).seconds_per_iteration == pytest.approx(2)
-    assert standing(read(a_run(tmp_path / "b", CONFIG, rows[:1]))).seconds_per_iteration == pytest.approx(62)
 
 
 def test_what_tells_runs_apart_is_shown(tmp_path, capsys):
@@ -165,7 +158,7 @@ def test_a_robots_run_shows_what_was_collected(tmp_path):
     line = printed([tmp_path], 200).splitlines()[-1]
     assert "50.0 collected" in line
     assert SPARKS[-1] in line
-    assert standing(read(tmp_path / "robot")).return_collected == 50.0
+    assert status_of(read(tmp_path / "robot")).return_collected == 50.0
 
 
 def test_the_command_prints_once_and_refuses_what_makes_no_sense(tmp_path, capsys):
@@ -205,70 +198,6 @@ def test_a_narrow_terminal_goes_without_some_columns(tmp_path):
         assert "return" in lines[0]
         assert "stopped" in lines[2]
         assert "…" not in lines[2]
-
-
-def test_whether_a_run_lives_is_seen_without_touching_its_lock(tmp_path):
-    config = Config("Swimmer")
-    assert not is_running(tmp_path)
-    held = claim(tmp_path, config)
-    before = (tmp_path / ".lock").stat()
-    assert is_running(tmp_path)
-    after = (tmp_path / ".lock").stat()
-    assert (before.st_mtime_ns, before.st_size) == (after.st_mtime_ns, after.st_size)
-    held.close()
-    assert not is_running(tmp_path), "the file stays, with a pid that lives"
-    assert (tmp_path / ".lock").read_text() == str(os.getpid())
-    with open(tmp_path / "other", "w") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
-        assert not is_running(tmp_path), "another lock of the same process"
-    claim(tmp_path, config).close()  # a look never kept a run from starting
-
-
-def test_watching_never_keeps_a_run_from_starting(tmp_path):
-    """50 claims while another thread looks without a pause."""
-    import threading
-
-    claim(tmp_path, Config("Swimmer")).close()
-    over = threading.Event()
-
-    def look():
-        while not over.is_set():
-            is_running(tmp_path)
-
-    looker = threading.Thread(target=look)
-    looker.start()
-    try:
-        for _ in range(50):
-            claim(tmp_path, Config("Swimmer")).close()
-    finally:
-        over.set()
-        looker.join()
-
-
-def test_without_a_list_of_locks_the_process_counts(tmp_path, monkeypatch):
-    real = Path.read_text
-    monkeypatch.setattr(
-        Path, "read_text", lambda self, *a, **k: real(Path("/nonexistent") if "proc" in str(self) else self, *a, **k)
-    )
-    (tmp_path / ".lock").write_text(str(os.getpid()))
-    assert is_running(tmp_path)
-    (tmp_path / ".lock").write_text("")
-    assert not is_running(tmp_path)
-    (tmp_path / ".lock").write_text("999999999")
-    assert not is_running(tmp_path)
-
-
-def test_budget_in_real_steps(tmp_path):
-    a_run(tmp_path / "a", dataclasses.replace(CONFIG, real_steps=36_000), TIMED)
-    seen = standing(read(tmp_path / "a"), now=time.time() + 100)
-    assert (seen.iteration, seen.iterations, seen.state) == (10, 12, "stopped")
-    assert 99 < seen.seconds_since < 200
-    a_run(tmp_path / "b", dataclasses.replace(CONFIG, real_steps=30_000), TIMED)
-    assert standing(read(tmp_path / "b")).state == "finished"
-    a_run(
-        tmp_path / "c", dataclasses.replace(CONFIG, real_steps=0, iterations=10), [r | {"real_steps": 0} for r in TIMED]
-    )
-    assert standing(read(tmp_path / "c")).state == "finished"
 
 
 def test_sparklines():

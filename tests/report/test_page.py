@@ -12,7 +12,7 @@ import pytest
 from metrpo.checks.health import examine
 from metrpo.commands.main import main
 from metrpo.config import ImagineConfig
-from metrpo.console.live_table import standing
+from metrpo.console.run_status import status_of
 from metrpo.errors import RunDirectoryError
 from metrpo.report import page as pages
 from metrpo.report.charts import Axes, Line, bars, chart, number, real_frame
@@ -286,7 +286,7 @@ def test_no_numbers_are_too_odd():
             Page(text)
             assert not re.search(r'="[^"<>a-z]*\b(nan|inf)\b', text), "no coordinate is nan"
             assert json.dumps(record(found))
-            assert standing(found.runs[0]).iteration == len(rows)
+            assert status_of(found.runs[0]).iteration == len(rows)
 
 
 def test_runs_are_found_once_and_groups_share_their_settings(tmp_path):

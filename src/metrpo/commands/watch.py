@@ -42,12 +42,13 @@ class Watch:
 
 def run(command: Watch) -> int:
     """Returns the exit code."""
-    from metrpo.console.live_table import standings_of, watch
+    from metrpo.console.live_table import watch
+    from metrpo.console.run_status import statuses_of
     from metrpo.run.find import find
 
     if command.json:
         found = find(command.dirs)
-        runs = [dataclasses.asdict(run) for run in standings_of(found.runs)]
+        runs = [dataclasses.asdict(run) for run in statuses_of(found.runs)]
         skipped = [{"path": str(path), "why": why} for path, why in found.skipped]
         print(json.dumps({"runs": runs, "skipped": skipped}))
         return 0

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Protocol
 
-from metrpo.console.live_table import is_running
+from metrpo.console.run_status import is_running
 from metrpo.launch.local import start
 from metrpo.launch.run_spec import RunSpec
 from metrpo.launch.status import is_finished

@@ -10,8 +10,8 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING
 
-from metrpo.console.live_table import is_running
 from metrpo.console.result_lines import duration
+from metrpo.console.run_status import is_running
 from metrpo.counting import counted
 from metrpo.errors import MetrpoError
 from metrpo.launch.local import shares_of_cores
