@@ -1,9 +1,7 @@
 """Stochastic value gradients in the real environment (Heess et al. 2015; settings: the paper, appendix "Baselines").
 
 After every real episode the model is trained on all data so far, and the policy takes one gradient step along that
-very episode: the noise of the policy and of the environment is inferred from what happened, so that the model is asked
-for its derivatives only, never for rollouts of its own. SVG(inf) differentiates the return of the whole episode, SVG(1)
-one step of it followed by a learned value.
+very episode (`metrpo.baselines.path_gradient`).
 """
 
 from __future__ import annotations
@@ -19,11 +17,12 @@ import optax
 
 from metrpo import budget
 from metrpo.baselines import on_policy
+from metrpo.baselines.path_gradient import RealPath, padded, state_value, value_gradient
 from metrpo.config import Config, FitConfig, GradientConfig, SVGConfig
 from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import ConfigError
 from metrpo.model import ensemble as ensembles
-from metrpo.model.ensemble import Activation, Carried, Ensemble, Networks, predict
+from metrpo.model.ensemble import Activation, Carried, Ensemble, Networks
 from metrpo.model.epochs import losses_of, minibatch
 from metrpo.policy import gaussian
 from metrpo.policy.advantage import discounted_returns
@@ -64,19 +63,6 @@ class SVGState(NamedTuple):
     replay: Transitions
 
 
-class RealPath(NamedTuple):
-    """One real episode, padded to the horizon T."""
-
-    states: Array
-    """[T + 1, S]"""
-    drawn: Array
-    """[T, A], actions before clipping."""
-    rewards: Array
-    """[T]"""
-    mask: Array
-    """[T], 1 within the episode."""
-
-
 def init(config: Config, task: Task) -> SVGState:
     """The state before the first iteration."""
     p, e = config.policy, config.ensemble
@@ -114,7 +100,7 @@ def step(config: Config, task: Task, state: SVGState, progress: Progress = SILEN
             most = config.collect.max_train
             replay = datasets.append(state.replay, drawn.episodes, most, carried=task.carried)
             state = state._replace(replay=replay)
-            path = _path(drawn.episodes[0].states, drawn.actions[0], drawn.episodes[0].rewards, task.horizon)
+            path = padded(drawn.episodes[0].states, drawn.actions[0], drawn.episodes[0].rewards, task.horizon)
         normaliser = _normaliser(config, task, state.replay)
         with clock("fit"):
             replay = jax.device_put(datasets.with_capacity(state.replay, config.collect.max_train))
@@ -145,70 +131,6 @@ def step(config: Config, task: Task, state: SVGState, progress: Progress = SILEN
         **clock.row(),
     }
     return state, row
-
-
-def value_gradient(
-    task: Task, ensemble: Ensemble, policy: Policy, path: RealPath, discount: float, value: Policy | None = None
-) -> Policy:
-    """The gradient of the path's discounted return with respect to the policy's parameters, the noise held fixed.
-
-    Without `value` through the whole path (SVG(inf)); with it, the sum over the path's steps of the gradient of
-    r + discount x value of the next state, the states visited being given (SVG(1)).
-    """
-    time = jnp.arange(path.mask.size)
-    residuals, noise = _inferred(ensemble, policy, path)
-
-    reward_of: Any = task.reward
-
-    def one(policy: Policy, state: Array, noise: Array, residual: Array) -> tuple[Array, Array]:
-        action = jnp.clip(gaussian.mean(policy, state) + jnp.exp(policy.log_std) * noise, -1.0, 1.0)
-        following = _predict(ensemble, state, action) + residual
-        return following, reward_of(state, action, following)
-
-    def whole(policy: Policy) -> Array:
-        def step(state: Array, given: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
-            noise, residual, mask, weight = given
-            following, reward = one(policy, state, noise, residual)
-            return jnp.where(mask > 0, following, state), mask * weight * reward
-
-        return jnp.sum(jax.lax.scan(step, path.states[0], (noise, residuals, path.mask, discount**time))[1])
-
-    def by_steps(policy: Policy) -> Array:
-        following, rewards = jax.vmap(partial(one, policy))(path.states[:-1], noise, residuals)
-        # The last step of the horizon has nothing after it.
-        going_on = jnp.append(path.mask[1:], 0.0)
-        after = _value(value, ensemble.normaliser, following, time + 1) if value is not None else 0.0
-        return jnp.sum(path.mask * (rewards + discount * going_on * after))
-
-    return jax.grad(whole if value is None else by_steps)(policy)
-
-
-def _inferred(ensemble: Ensemble, policy: Policy, path: RealPath) -> tuple[Array, Array]:
-    """What the model missed [T, S] and the policy's noise [T, A], such that both replay the path exactly."""
-    states = path.states[:-1]
-    predicted = jax.vmap(partial(_predict, ensemble))(states, jnp.clip(path.drawn, -1.0, 1.0))
-    noise = (path.drawn - gaussian.mean(policy, states)) * jnp.exp(-policy.log_std)
-    return path.states[1:] - predicted, noise
-
-
-def _predict(ensemble: Ensemble, state: Array, action: Array) -> Array:
-    return predict(ensemble, state[None, None], action[None, None])[0, 0]
-
-
-def _value(value: Policy, normaliser: Normaliser, states: Array, time: Array) -> Array:
-    """[n], of states [n, S] after `time` [n] steps."""
-    seen = (states - normaliser.state_mean) * normaliser.state_scale
-    return gaussian.mean(value, jnp.concatenate([seen, time[:, None] / 100.0], axis=-1))[:, 0]
-
-
-def _path(states: np.ndarray, drawn: np.ndarray, rewards: np.ndarray, horizon: int) -> RealPath:
-    missing = horizon - len(rewards)
-    return RealPath(
-        np.concatenate([states, np.repeat(states[-1:], missing, axis=0)]).astype(np.float32),
-        np.concatenate([drawn, np.zeros((missing, drawn.shape[1]), np.float32)]),
-        np.append(rewards, np.zeros(missing, np.float32)),
-        (np.arange(horizon) < len(rewards)).astype(np.float32),
-    )
 
 
 def _normaliser(config: Config, task: Task, replay: Transitions) -> Normaliser:
@@ -289,7 +211,7 @@ def _train_value(
     returns = discounted_returns(path.rewards[:, None], path.mask[:, None], settings.discount)[:, 0]
 
     def loss(value: Policy) -> Array:
-        errors = _value(value, normaliser, path.states[:-1], jnp.arange(path.mask.size)) - returns
+        errors = state_value(value, normaliser, path.states[:-1], jnp.arange(path.mask.size)) - returns
         return jnp.sum(path.mask * jnp.square(errors)) / jnp.sum(path.mask)
 
     def step(_: Array, carry: tuple[Policy, Any]) -> tuple[Policy, Any]:
