@@ -100,23 +100,14 @@ def learn(
     """
     iteration = state.iteration + 1
     clock = clock or Clock()
-    rng = rng_of(config.seed, iteration, Stage.SPLIT)
-    dataset = datasets.add(state.dataset, episodes, config.collect, rng, task.learned, task.carried)
-    require_finite("collect", iteration, "leave out the episode that holds it", dataset=dataset)
-    if state.iteration == 0:
-        scales.warn(config, task, dataset, episodes)
+    state = _with_data(config, task, state, episodes)
     with clock("fit"):
         progress.stage("fit", None)
-        ensemble, fitted = fit_ensemble(config, task, state.networks, dataset, iteration, progress)
+        ensemble, fitted = fit_ensemble(config, task, state.networks, state.dataset, iteration, progress)
         require_finite("fit", iteration, "start anew with a lower fit.learning_rate", **ensemble._asdict())
     with clock("improve"):
         progress.stage("improve", config.validate.max_updates)
-        if state.iteration == 0 and (inputs := inputs_for(config, task, dataset)):
-            # A fresh policy's weights expect normalised states; only the first data gives the scales.
-            state = state._replace(policy=folded(state.policy, inputs))
-        policy, baseline, improved = improve_policy(
-            config, task, state._replace(dataset=dataset), ensemble, progress, clock
-        )
+        policy, baseline, improved = improve_policy(config, task, state, ensemble, progress, clock)
         advice = "training cannot continue from this state: use smaller steps or start anew"
         require_finite("improve", iteration, advice, policy=policy, baseline=baseline)
     candidate = State(
@@ -126,7 +117,7 @@ def learn(
         previous_policy=state.policy if improved.accepted_updates else state.previous_policy,
         networks=ensemble.networks,
         baseline=baseline,
-        dataset=dataset,
+        dataset=state.dataset,
         proven=state.proven,
     )
     with clock("collect"):
@@ -135,6 +126,21 @@ def learn(
         progress.stage("evaluate", config.evaluation_episodes)
         row = record(config, task, following, Done(episodes, real.failed, ensemble, fitted, improved, verdict))
     return following, row | clock.row()
+
+
+def _with_data(config: Config, task: Task, state: State, episodes: list[Episode]) -> State:
+    """The state with the episodes in its dataset; a fresh policy takes its scales from the first ones."""
+    iteration = state.iteration + 1
+    rng = rng_of(config.seed, iteration, Stage.SPLIT)
+    dataset = datasets.add(state.dataset, episodes, config.collect, rng, task.learned, task.carried)
+    require_finite("collect", iteration, "leave out the episode that holds it", dataset=dataset)
+    state = state._replace(dataset=dataset)
+    if state.iteration == 0:
+        scales.warn(config, task, dataset, episodes)
+        if inputs := inputs_for(config, task, dataset):
+            # A fresh policy's weights expect normalised states; only the first data gives the scales.
+            state = state._replace(policy=folded(state.policy, inputs))
+    return state
 
 
 def _logged(config: Config, task: Task) -> Dataset:
