@@ -324,10 +324,16 @@ def captured_fit(monkeypatch, config, iteration, dataset):
 def test_networks_start_afresh_in_every_nth_iteration(tiny, monkeypatch, every, fresh):
     config = override(TINY, {"fit.reinitialise_every": every})
     dataset = tiny.states[1].dataset
-    networks = {i: captured_fit(monkeypatch, config, i, dataset)[0] for i in range(1, 12)}
+    networks = {i: captured_fit(monkeypatch, config, i, dataset)[0].networks for i in range(1, 12)}
     assert [i for i, n in networks.items() if n != "the last networks"] == fresh
     for i, j in itertools.pairwise(fresh):
         assert not np.allclose(networks[i][0][0], networks[j][0][0]), "and differ from iteration to iteration"
+
+
+@pytest.mark.parametrize("name", ["relu", "silu"])
+def test_the_models_have_the_units_that_the_settings_ask_for(tiny, monkeypatch, name):
+    config = override(TINY, {"ensemble.activation": name})
+    assert captured_fit(monkeypatch, config, 2, tiny.states[1].dataset)[0].activation.name == name
 
 
 def test_the_normaliser_is_of_the_training_data_alone(tiny, monkeypatch):
@@ -336,7 +342,8 @@ def test_the_normaliser_is_of_the_training_data_alone(tiny, monkeypatch):
         states=dataset.validation.states + 1e3, deltas=dataset.validation.deltas * 1e3
     )
     given = captured_fit(monkeypatch, TINY, 2, dataset._replace(validation=garbage))
-    _, normaliser, train, validation, fit_config, _, _ = given
+    ensemble, train, validation, fit_config, _, _ = given
+    normaliser = ensemble.normaliser
     rows = dataset.train
     np.testing.assert_allclose(normaliser.state_mean, rows.states.mean(0), rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(normaliser.state_scale, 1 / np.maximum(rows.states.std(0), 0.1), rtol=1e-4)

@@ -197,10 +197,10 @@ def _replaced(node: Any, values: Overrides, section: str) -> Any:
     changes: dict[str, Any] = {}
     within: dict[str, Overrides] = {}
     for name, value in values.items():
-        first, _, rest = name.partition(".")
+        first, dot, rest = name.partition(".")
         if first not in known:
             raise ConfigError(f"unknown setting {section + name!r} (see: metrpo train --help-all)")
-        if rest:
+        if dot:
             within.setdefault(first, {})[rest] = value
         else:
             changes[first] = convert(typing.get_type_hints(type(node))[first], value, section + name)

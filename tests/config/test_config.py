@@ -343,7 +343,7 @@ def test_override_replaces_only_what_it_names():
     assert set(difference(base, config)) == {"fit.patience", "seed", "policy.hidden"}
 
 
-@pytest.mark.parametrize("name", ["colour", "fit.colour", "fit.patience.more", "fit.", "", "Fit.patience"])
+@pytest.mark.parametrize("name", ["colour", "fit.colour", "fit.patience.more", "seed.more", "fit.", "", "Fit.patience"])
 def test_override_refuses_an_unknown_setting(name):
     with pytest.raises(ConfigError, match=f"unknown setting '{name}'"):
         override(Config(task="x"), {name: 1})
