@@ -40,9 +40,9 @@ def test_runs_grids_and_searches_agree_on_a_spent_budget(given, iteration, real_
         ("Swimmer", {"real_steps": 15_000}, 0, 0, None),
         ("Swimmer", {"real_steps": 15_000}, 2, 3000, 8),
         ("Swimmer", {"real_steps": 15_000}, 10, 15_000, 0),
-        # Its first iteration takes 3,000 random steps, the others 1,000.
-        ("Ant", {"real_steps": 20_000}, 1, 3000, 17),
-        ("Ant", {"real_steps": 20_000}, 11, 13_000, 7),
+        # Its first iteration takes 3,000 random steps, the others 250.
+        ("Ant", {"real_steps": 20_000}, 1, 3000, 68),
+        ("Ant", {"real_steps": 20_000}, 41, 13_000, 28),
         ("Ant", {"real_steps": 2000}, 1, 2000, 0),
     ],
 )

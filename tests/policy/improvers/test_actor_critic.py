@@ -241,7 +241,7 @@ def test_an_update_averages_the_targets_and_weighs_the_entropy(compiled):
     new, info, imagined = compiled(one, starts(), real_steps(), KEY)
     assert info.accepted
     assert float(imagined.diverged) == 0
-    moved = jax.tree.map(lambda old, to: old + 0.005 * (to - old), one.targets, new.critics)
+    moved = jax.tree.map(lambda old, to: old + 0.02 * (to - old), one.targets, new.critics)
     for got, expected in zip(jax.tree.leaves(new.targets), jax.tree.leaves(moved), strict=True):
         np.testing.assert_allclose(got, expected, rtol=1e-6)
     assert float(info.entropy) > -2
