@@ -12,12 +12,24 @@ import numpy as np
 from summarise import ROOT, no_skill, real_steps
 
 from metrpo import read_metrics
+from metrpo.presets import usual_system
 from metrpo.report.tables import markdown
 
 FOLDERS = ("fast", "laptop")
 """Of results/: a task's row is of the first one that has runs of it, those of the preset as it is, or as it was."""
 TASKS = ("Swimmer", "Snake", "HalfCheetah", "Hopper", "HopperUpright", "Ant", "Humanoid", "HumanoidStandup")
-HEADER = ("task", "real steps", "seeds", "return", "worst seed", "doing nothing", "random actions", "ceiling", "runs")
+HEADER = (
+    "task",
+    "system",
+    "real steps",
+    "seeds",
+    "return",
+    "worst seed",
+    "doing nothing",
+    "random actions",
+    "ceiling",
+    "runs",
+)
 
 
 def table() -> str:
@@ -26,7 +38,9 @@ def table() -> str:
 
 
 def _row(task: str) -> tuple[str, ...] | None:
-    found = {name: sorted((ROOT / name / task / "me-trpo").glob("seed-*/metrics.csv")) for name in FOLDERS}
+    # The preset as it is has the task's usual system; as it was, all were learned by me-trpo.
+    systems = {"fast": usual_system(task, "fast", {}), "laptop": "me-trpo"}
+    found = {name: sorted((ROOT / name / task / systems[name]).glob("seed-*/metrics.csv")) for name in FOLDERS}
     folder = next((name for name in FOLDERS if found[name]), None)
     if folder is None:
         return None
@@ -36,6 +50,7 @@ def _row(task: str) -> tuple[str, ...] | None:
     ceiling = f"{json.loads(file.read_text())['best']['mean']:.0f}" if file.exists() else "not searched"
     return (
         task,
+        systems[folder],
         real_steps(last),
         str(len(last)),
         f"{np.mean(returns):.1f}",

@@ -1,7 +1,7 @@
 """Chooses the policies of `metrpo zoo` among committed runs: `python benchmarks/tools/fill_zoo.py [FOLDER...]`.
 
 For each task that can be played by its name, the policy with the best real return in its run's last evaluation, of all
-ME-TRPO runs under the folders (default: results/); not one that earns no more than doing nothing or random actions.
+model-based runs under the folders (default: results/); not one that earns no more than doing nothing or random actions.
 Writes `src/metrpo/zoo_policies/` anew, policies in today's format and a card each. Run it again when runs are added.
 """
 
