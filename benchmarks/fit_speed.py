@@ -18,11 +18,10 @@ import jax
 import numpy as np
 
 from metrpo import config, get_task, init
-from metrpo.model import ensemble as ensembles
-from metrpo.model.ensemble import Activation, Ensemble
 from metrpo.model.fit import fit
 from metrpo.presets import override
 from metrpo.run.directory import RunDirectory
+from metrpo.stages.ensemble_fit import ensemble_of, fresh_networks
 from metrpo.types import Transitions
 from metrpo.world import dataset as datasets
 
@@ -50,15 +49,14 @@ def main() -> None:
     for variant in arguments.variants:
         values = {} if variant == "as-run" else dict(pair.split("=") for pair in re.split(r",(?=[a-z])", variant))
         now = override(settings, {name: json.loads(value) for name, value in values.items()})
-        e, losses, seconds = now.ensemble, [], []
-        networks = ensembles.init(jax.random.key(7), e.members, task.state_size, task.action_size, e.hidden)
+        losses, seconds = [], []
+        networks = fresh_networks(now, task, jax.random.key(7))
         for iteration in range(1, ITERATIONS + 1):
             share = iteration / state.iteration
             train = first(state.dataset.train, share, now.collect.max_train)
             validation = first(state.dataset.validation, share, now.collect.max_validation)
             real = Transitions(*(np.asarray(x[: int(train.size)]) for x in train[:3]), int(train.size))
-            normaliser = ensembles.normaliser_of(real, e.std_floor, e.delta_std_floor, task.unseen)
-            before = Ensemble(networks, normaliser, activation=Activation(e.activation))
+            before = ensemble_of(now, task, networks, real)
             start = time.perf_counter()
             ensemble, info = fit(before, train, validation, now.fit, jax.random.key(iteration))
             losses.append(float(np.mean(info.validation_loss)))

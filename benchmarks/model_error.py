@@ -18,6 +18,7 @@ from stored import newest_of
 
 from metrpo.model import ensemble as ensembles
 from metrpo.policy import gaussian
+from metrpo.stages.ensemble_fit import ensemble_of
 from metrpo.types import Episode
 from metrpo.world.collection import collect, explore
 from metrpo.world.registry import task_for
@@ -48,11 +49,8 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=20)
     arguments = parser.parse_args()
     settings, state = newest_of(arguments.run_dir)
-    task, e = task_for(settings), settings.ensemble
-    normaliser = ensembles.normaliser_of(state.dataset.train, e.std_floor, e.delta_std_floor, task.unseen)
-    ensemble = ensembles.Ensemble(
-        state.networks, normaliser, ensembles.Carried(task.carried), ensembles.Activation(e.activation)
-    )
+    task = task_for(settings)
+    ensemble = ensemble_of(settings, task, state.networks, state.dataset.train)
     act = partial(gaussian.mean, jax.tree.map(np.asarray, state.policy))
     rng, steps = np.random.default_rng(2**40), arguments.episodes * task.horizon
     episodes = collect(task, lambda rng: explore(act, settings.collect, rng), steps, rng)

@@ -21,14 +21,13 @@ from stored import newest_of
 from metrpo import State, init, policy_phase
 from metrpo.config import Config
 from metrpo.console.progress import SILENT
-from metrpo.model import ensemble as ensembles
 from metrpo.model.diagnostics import diagnose
-from metrpo.model.ensemble import Activation, Carried, Ensemble
 from metrpo.policy.value.value_table import init_baseline
 from metrpo.presets import override
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of
 from metrpo.stages import policy_search, records
+from metrpo.stages.ensemble_fit import ensemble_of
 from metrpo.world.registry import task_for
 
 
@@ -53,9 +52,8 @@ def main() -> None:
 def phases(config: Config, state: State, count: int, fresh: bool, variant: str, seed: int) -> float:
     """Plays `count` phases and returns what the last policy earns."""
     config = override(config, {"seed": seed})
-    task, e, data = task_for(config), config.ensemble, state.dataset
-    normaliser = ensembles.normaliser_of(data.train, e.std_floor, e.delta_std_floor, task.unseen)
-    ensemble = Ensemble(state.networks, normaliser, Carried(task.carried), Activation(e.activation))
+    task, data = task_for(config), state.dataset
+    ensemble = ensemble_of(config, task, state.networks, data.train)
     first = init(config).policy if fresh else state.policy
     baseline = init_baseline(config.advantage, task.state_size, key_of(seed, 0, Stage.IMPROVE))
     state = state._replace(policy=first, baseline=baseline)

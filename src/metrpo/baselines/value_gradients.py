@@ -22,7 +22,7 @@ from metrpo.config import Config, FitConfig, GradientConfig, SVGConfig
 from metrpo.console.progress import SILENT, Progress
 from metrpo.errors import ConfigError
 from metrpo.model import ensemble as ensembles
-from metrpo.model.ensemble import Activation, Carried, Ensemble, Networks
+from metrpo.model.ensemble import Ensemble, Networks
 from metrpo.model.epochs import losses_of, minibatch
 from metrpo.policy import gaussian
 from metrpo.policy.advantage import discounted_returns
@@ -31,6 +31,7 @@ from metrpo.policy.improvers.adam import ascend, init_moments
 from metrpo.run.clock import Clock
 from metrpo.run.metrics import Row
 from metrpo.seeds import Stage, key_of, rng_of
+from metrpo.stages.ensemble_fit import ensemble_of
 from metrpo.stages.records import recorded_returns
 from metrpo.types import Array, Episode, Normaliser, Transitions
 from metrpo.world import dataset as datasets
@@ -101,13 +102,13 @@ def step(config: Config, task: Task, state: SVGState, progress: Progress = SILEN
             replay = datasets.append(state.replay, drawn.episodes, most, carried=task.carried)
             state = state._replace(replay=replay)
             path = padded(drawn.episodes[0].states, drawn.actions[0], drawn.episodes[0].rewards, task.horizon)
-        normaliser = _normaliser(config, task, state.replay)
+        ensemble = ensemble_of(config, task, state.networks, state.replay)
         with clock("fit"):
             replay = jax.device_put(datasets.with_capacity(state.replay, config.collect.max_train))
-            state, loss = _fit(config, state, normaliser, replay, jax.random.fold_in(key, steps))
+            state, loss = _fit(config, state, ensemble, replay, jax.random.fold_in(key, steps))
             jax.block_until_ready(state.networks)
         with clock("improve"):
-            state, norm, made = _improve(config, task, state, normaliser, path)
+            state, norm, made = _improve(config, task, state, ensemble._replace(networks=state.networks), path)
         losses.append(float(loss))
         norms.append(float(norm))
         finite.append(bool(made))
@@ -133,15 +134,9 @@ def step(config: Config, task: Task, state: SVGState, progress: Progress = SILEN
     return state, row
 
 
-def _normaliser(config: Config, task: Task, replay: Transitions) -> Normaliser:
-    e = config.ensemble
-    return ensembles.normaliser_of(replay, e.std_floor, e.delta_std_floor, task.unseen)
-
-
 def _fit(
-    config: Config, state: SVGState, normaliser: Normaliser, replay: Transitions, key: Array
+    config: Config, state: SVGState, ensemble: Ensemble, replay: Transitions, key: Array
 ) -> tuple[SVGState, Array]:
-    ensemble = Ensemble(state.networks, normaliser, activation=Activation(config.ensemble.activation))
     networks, moments, loss = _train_model(
         config.fit, config.svg.model_steps, ensemble, state.model_moments, replay, key
     )
@@ -174,12 +169,12 @@ def _train_model(
 
 
 def _improve(
-    config: Config, task: Task, state: SVGState, normaliser: Normaliser, path: RealPath
+    config: Config, task: Task, state: SVGState, ensemble: Ensemble, path: RealPath
 ) -> tuple[SVGState, Array, Array]:
     learned, norm, made = _train_policy(
         PolicySettings(config.svg, config.gradient, config.advantage.discount),
         task,
-        Ensemble(state.networks, normaliser, Carried(task.carried), Activation(config.ensemble.activation)),
+        ensemble,
         (state.policy, state.policy_moments, state.value, state.value_moments),
         path,
     )

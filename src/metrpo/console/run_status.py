@@ -58,11 +58,8 @@ class RunStatus:
 def status_of(run: SeenRun, now: float | None = None, changed: Mapping[str, str] | None = None) -> RunStatus:
     """The status of a run; `now` is the time in seconds, `changed` what tells it from other runs (`told_apart`)."""
     config, rows = run.config, run.rows
-    real, collected, concerns = (
-        run.column("return_real"),
-        run.column("return_collected"),
-        examine(rows, config, run.yardsticks),
-    )
+    real, collected = run.column("return_real"), run.column("return_collected")
+    concerns = examine(rows, config, run.yardsticks)
     seconds = _seconds(run)
     total, iteration = _total(run), int(rows[-1]["iteration"] or 0) if rows else 0
     state = "finished" if is_finished(run) else "running" if is_running(run.path) else "stopped"

@@ -14,7 +14,7 @@ from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Activation, Carried, Ensemble, Networks
 from metrpo.model.fit import FitInfo, fit, refit
 from metrpo.seeds import Stage, key_of
-from metrpo.types import Array
+from metrpo.types import Array, Transitions
 from metrpo.world import dataset as datasets
 from metrpo.world.dataset import Dataset
 from metrpo.world.task import Task
@@ -33,9 +33,7 @@ def fit_ensemble(
     every = config.fit.reinitialise_every
     if every and (iteration - 1) % every == 0:
         networks = fresh_networks(config, task, init_key)
-    e = config.ensemble
-    normaliser = ensembles.normaliser_of(dataset.train, e.std_floor, e.delta_std_floor, task.unseen)
-    ensemble = Ensemble(networks, normaliser, Carried(task.carried), Activation(e.activation))
+    ensemble = ensemble_of(config, task, networks, dataset.train)
     train = jax.device_put(datasets.with_capacity(dataset.train, config.collect.max_train))
     validation = jax.device_put(datasets.with_capacity(dataset.validation, config.collect.max_validation))
 
@@ -62,6 +60,13 @@ def fit_ensemble(
 
 def _named(members: np.ndarray) -> str:
     return f"members {', '.join(map(str, np.flatnonzero(members)))}"
+
+
+def ensemble_of(config: Config, task: Task, networks: Networks, train: Transitions) -> Ensemble:
+    """The task's ensemble of `networks`, which see `train` (host arrays) with mean 0 and standard deviation 1."""
+    e = config.ensemble
+    normaliser = ensembles.normaliser_of(train, e.std_floor, e.delta_std_floor, task.unseen)
+    return Ensemble(networks, normaliser, Carried(task.carried), Activation(e.activation))
 
 
 def fresh_networks(config: Config, task: Task, key: Array) -> Networks:
