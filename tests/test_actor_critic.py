@@ -13,11 +13,13 @@ from counted_run import run
 from helpers import linear_ensemble
 from metrpo import algorithm, external, training
 from metrpo.config import Config
+from metrpo.console.progress import Progress
 from metrpo.errors import ConfigError
 from metrpo.policy import squashed
 from metrpo.policy.inputs import normalised
 from metrpo.presets import override, preset
 from metrpo.run import derived_files, directory
+from metrpo.run.clock import Clock
 from metrpo.run.files import atomic_write
 from metrpo.run.metrics import read_metrics
 from metrpo.run.policy_export import export
@@ -192,6 +194,21 @@ def test_models_are_trusted_as_far_as_they_agree_on_most_of_the_held_out_steps(s
     assert np.quantile(apart, 0.85) < float(trusted(1.0)) <= apart.max() * 1.001
     assert float(trusted(2.0)) == pytest.approx(2 * float(trusted(1.0)))
     assert trusted(0.0) is None
+
+
+def test_what_it_learns_does_not_depend_on_the_unit_of_rewards(small):
+    ensemble = linear_ensemble([(probe.A * factor, probe.B) for factor in (0.9, 1.1)])
+    state = small.states[0]._replace(dataset=small.states[1].dataset)
+
+    def learned(unit):
+        task = dataclasses.replace(probe.PROBE, reward=lambda *step: unit * probe.reward(*step))
+        return actor_critic_search.improve_policy(SMALL, task, state, ensemble, Progress(), Clock())[:2]
+
+    (policy, learner), (same, other) = learned(1), learned(64)
+    assert not equal(policy, state.policy)
+    for one, two in zip(jax.tree.leaves(policy), jax.tree.leaves(same), strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-5)
+    assert float(other.log_entropy_weight - learner.log_entropy_weight) == pytest.approx(np.log(64), rel=1e-4)
 
 
 def test_without_a_discount_it_is_refused():

@@ -126,8 +126,8 @@ class ActorCriticConfig:
     """The first so many states of an imagined episode are what critics learn from, each valued by all that follows."""
     target_rate: float = 0.02
     """Share of the critics that goes into their moving average, the targets, at every update."""
-    entropy_weight: float = 0.1
-    """What a nat of the actor's entropy is worth in rewards, at first."""
+    entropy_weight: float = 0.15
+    """What a nat of the actor's entropy is worth at first, in standard deviations of the first rewards."""
     entropy_target: float = -1.0
     """Nats for each action towards which that weight steers the entropy."""
     entropy_learning_rate: float = 3e-4

@@ -28,7 +28,7 @@ from metrpo.policy.improvers import actor_critic
 from metrpo.policy.improvers.actor_critic import Learner, Steps, UpdateInfo, UpdateSettings
 from metrpo.policy.inputs import normalised
 from metrpo.policy.stopping import improved
-from metrpo.policy.value.critics import ValueScale, rescaled, scale_of
+from metrpo.policy.value.critics import ValueScale, rescaled, reward_spread, scale_of
 from metrpo.policy_phase import PhaseInfo, simulator_of, values_of
 from metrpo.run.clock import Clock
 from metrpo.seeds import Stage, key_of, rng_of
@@ -97,7 +97,8 @@ def improve_policy(
         simulator_of(config, known, ensemble, inputs), bounds=bounds, trusted=_trusted(config, ensemble, dataset, rng)
     )
     real_steps = _real_steps(known, ensemble, dataset)
-    before = learner = _in_units(state, scale_of(real_steps.rewards, settings.discount, bool(task.terminated)))
+    scale = scale_of(real_steps.rewards, settings.discount, bool(task.terminated))
+    before = learner = _in_units(state, scale, settings.discount)
     real_steps = real_steps._replace(
         states=normalised(inputs, real_steps.states), following=normalised(inputs, real_steps.following)
     )
@@ -138,11 +139,12 @@ def _blocks(config: Config, real_steps: int) -> int:
     return max(1, round(updates / config.actor_critic.block))
 
 
-def _in_units(state: State, scale: ValueScale) -> Learner:
-    """The learner with critics in the units of the data as they are now."""
+def _in_units(state: State, scale: ValueScale, discount: float) -> Learner:
+    """The learner, critics in the units of the data as they are now; at first, its entropy is too."""
     learner: Learner = state.baseline
     if state.iteration == 0:  # it says the middle of what is possible, whatever that turns out to be
-        return learner._replace(scale=scale)
+        weight = learner.log_entropy_weight + np.float32(math.log(reward_spread(scale, discount)))
+        return learner._replace(scale=scale, log_entropy_weight=weight)
     critics, targets = (rescaled(x, learner.scale, scale) for x in (learner.critics, learner.targets))
     return learner._replace(critics=critics, targets=targets, scale=scale)
 

@@ -8,7 +8,7 @@ import pytest
 
 from helpers import on_host
 from metrpo.policy.value import critics as networks
-from metrpo.policy.value.critics import ValueScale, averaged, rescaled, scale_of, valued
+from metrpo.policy.value.critics import ValueScale, averaged, rescaled, reward_spread, scale_of, valued
 
 KEY = jax.random.key(0)
 
@@ -63,6 +63,11 @@ def test_the_scale_is_of_what_rewards_add_up_to():
 def test_where_episodes_end_critics_begin_at_nothing():
     scale = scale_of(np.full(100, 2.0), 0.5, ends=True)
     np.testing.assert_allclose(scale, [0, 0.25 * 4, -4, 8])
+
+
+def test_the_spread_of_rewards_is_read_off_their_scale():
+    assert reward_spread(scale_of(np.array([-1.0, 3.0, -1.0, 3.0]), 0.9, ends=False), 0.9) == pytest.approx(2)
+    assert reward_spread(scale_of(np.full(100, 2.0), 0.5, ends=True), 0.5) == pytest.approx(2)
 
 
 @pytest.mark.parametrize("reward", [0.0, -3.0, 5.0])

@@ -87,6 +87,11 @@ def scale_of(rewards: np.ndarray, discount: float, ends: bool) -> ValueScale:
     return ValueScale(*(np.float32(reach * number) for number in numbers))
 
 
+def reward_spread(scale: ValueScale, discount: float) -> float:
+    """The std of the rewards that this scale is of; where episodes may end, at least the size of their mean."""
+    return float(scale.width) * (1.0 - discount) / _VARIES
+
+
 def rescaled(critics: Critics, old: ValueScale, new: ValueScale) -> Critics:
     """Critics that say in the `new` units what they said in the `old` ones (van Hasselt et al. 2016)."""
     ratio, shift = old.width / new.width, (old.middle - new.middle) / new.width
