@@ -331,6 +331,14 @@ def test_a_wrong_formula_is_shown_where_it_is_wrong(task, message):
         check_formulas(task(), np.random.default_rng(0))
 
 
+def test_a_formula_that_is_nearly_right_passes_where_only_what_it_holds_for_is_changed():
+    """Without contact forces, and with a dearer effort, which the formula does not have."""
+    plain = {"include_cfrc_ext_in_observation": False, "contact_cost_weight": 0.0}
+    check_formulas(get_task("Ant-v5", plain), np.random.default_rng(0))
+    with pytest.raises(TaskError, match="the reward formula disagrees"):
+        check_formulas(get_task("Ant-v5", plain | {"ctrl_cost_weight": 0.7}), np.random.default_rng(0))
+
+
 def test_training_checks_first_and_can_be_told_not_to(monkeypatch):
     wrong = dataclasses.replace(pendulum(lambda s, a, n: 0 * s[..., 0]), name="Wrong")
     monkeypatch.setitem(registry._TASKS, "Wrong", wrong)

@@ -45,7 +45,7 @@ def _check_rewards(task: Task, episodes: list[Episode]) -> None:
         )
     off = np.abs(said - paid)
     off = np.where(np.isfinite(off), off, np.inf)
-    if np.any(off > TOLERANCE * (1 + np.abs(paid))):
+    if np.any(off > TOLERANCE * (1 + np.abs(paid)) + task.reward_error):
         at = int(np.argmax(off))
         raise TaskError(
             f"{task.name}: the reward formula disagrees with the environment: of {len(paid)} random transitions the "

@@ -49,6 +49,9 @@ class Task:
     """N, the observations that a state holds, with the N-1 actions between them (`metrpo.history`). The setting
     `history` changes it (`world.history_env`): leave it at 1 in your own tasks."""
 
+    reward_error: float = 0.0
+    """By how much a single reward of the formula may differ from the environment's."""
+
     def __post_init__(self) -> None:
         require_size(self.name, self.state_size)
         require_horizon(self.name, self.horizon)

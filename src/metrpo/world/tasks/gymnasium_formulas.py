@@ -36,6 +36,8 @@ class Known:
     """One line."""
     added: int = 0
     """Global positions at the head of the observation, which the environment leaves out unless asked for them."""
+    reward_error: float = 0.0
+    """By how much a single reward may differ from the environment's."""
 
 
 def _squared(x: Array) -> Array:
@@ -212,10 +214,13 @@ def _known(
     reward: RewardFormula,
     terminated: EndFormula | None = None,
     unseen: tuple[int, ...] = (),
+    reward_error: float = 0.0,
 ) -> Known:
     """A task of Gymnasium; where global positions are unseen, they are added to the observation."""
     added = {"exclude_current_positions_from_observation": False} if unseen else {}
-    return Known(name, partial(_make, name, **added), reward, terminated, unseen, description, len(unseen))
+    return Known(
+        name, partial(_make, name, **added), reward, terminated, unseen, description, len(unseen), reward_error
+    )
 
 
 _hopper, _walker = (_forward(0.008, 1e-3, ends) for ends in (_hopper_terminated, _walker_terminated))
@@ -230,8 +235,8 @@ _TASKS = (
     _known("HalfCheetah-v5", "two legs in a plane run along x", _forward(0.05, 0.1), None, (0,)),
     _known("Hopper-v5", "one leg hops along x", _hopper, _hopper_terminated, (0,)),
     _known("Walker2d-v5", "two legs in a plane walk along x", _walker, _walker_terminated, (0,)),
-    _known("Ant-v5", "four legs walk along x", _ant_reward, _ant_terminated, (0, 1)),
-    _known("Humanoid-v5", "a humanoid walks along x", _humanoid_reward, _humanoid_terminated, (0, 1)),
+    _known("Ant-v5", "four legs walk along x", _ant_reward, _ant_terminated, (0, 1), 0.15),
+    _known("Humanoid-v5", "a humanoid walks along x", _humanoid_reward, _humanoid_terminated, (0, 1), 0.02),
     *(
         Known(f"mbbl/{name}", partial(mbbl.make, name), t.reward, None, (), t.description)
         for name, t in mbbl.TASKS.items()
