@@ -187,13 +187,16 @@ def test_models_are_trusted_as_far_as_they_agree_on_most_of_the_held_out_steps(s
     ensemble = linear_ensemble([(probe.A * factor, probe.B) for factor in (0.9, 1.1)])
     apart = np.abs(0.1 * data.validation.states @ probe.A.T).mean(axis=1)
 
-    def trusted(trust):
-        config = override(SMALL, {"actor_critic.trust": trust})
+    def trusted(trust, agreement=0.0):
+        config = override(SMALL, {"actor_critic.trust": trust, "actor_critic.agreement": agreement})
         return actor_critic_search._trusted(config, ensemble, data, np.random.default_rng(0))
 
     assert np.quantile(apart, 0.85) < float(trusted(1.0)) <= apart.max() * 1.001
     assert float(trusted(2.0)) == pytest.approx(2 * float(trusted(1.0)))
     assert trusted(0.0) is None
+    assert trusted(0.0, agreement=0.5) is None
+    assert float(trusted(1.0, agreement=0.5)) == 0.5
+    assert float(trusted(1.0, agreement=1e-4)) == float(trusted(1.0))
 
 
 def test_what_it_learns_does_not_depend_on_the_unit_of_rewards(small):

@@ -27,6 +27,7 @@ _SVG: Overrides = {
 
 ACTOR_CRITIC: Overrides = {
     "improver": "actor-critic",
+    "actor_critic.agreement": 0.2,
     "advantage.discount": 0.99,
     "collect.piece": 50,
     "collect.steps": 250,

@@ -169,6 +169,7 @@ IMPOSSIBLE = {
     "actor_critic.real_batch": [-1],
     "actor_critic.horizon": [-1],
     "actor_critic.trust": [-0.1, float("inf")],
+    "actor_critic.agreement": [-0.1, float("inf")],
     "actor_critic.branch_steps": [0],
     "actor_critic.margin": [-0.1, float("nan")],
     "actor_critic.block": [0],

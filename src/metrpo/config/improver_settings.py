@@ -111,7 +111,9 @@ class ActorCriticConfig:
     """Steps imagined from states of the dataset; updates start in the states that these reach."""
     trust: float = 1.0
     """Imagined steps end where members disagree by more than this times their disagreement on 95 % of the held-out
-    data; 0: never."""
+    data, and by more than `agreement`; 0: never."""
+    agreement: float = 0.0
+    """Disagreement that is trusted in any case, in standard deviations of a step's change."""
     margin: float = 0.25
     """Imagined states, their changes and learned rewards stay within the data's range, and this times it beyond."""
     block: int = 50
@@ -146,6 +148,7 @@ class ActorCriticConfig:
         least = 0 if self.horizon else 1
         require(self.real_batch >= least, f"{name}.real_batch", self.real_batch, f"at least {least}")
         require(nonnegative(self.trust), f"{name}.trust", self.trust, "a finite number >= 0")
+        require(nonnegative(self.agreement), f"{name}.agreement", self.agreement, "a finite number >= 0")
         require(self.random_steps >= 0, f"{name}.random_steps", self.random_steps, "at least 0")
         require(nonnegative(self.margin), f"{name}.margin", self.margin, "a finite number >= 0")
         hidden = self.critic_hidden

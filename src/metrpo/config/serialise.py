@@ -49,6 +49,7 @@ ADDED = (
     "config.learn_reward",
     "config.trust_reward",
     "config.collect.piece",
+    "config.actor_critic.agreement",
     "config.actor_critic",
 )
 """Settings newer than the first config.json files: where one is missing, the run used its default."""

@@ -161,12 +161,12 @@ def _real_steps(task: Task, ensemble: Ensemble, dataset: Dataset) -> Steps:
 
 
 def _trusted(config: Config, ensemble: Ensemble, dataset: Dataset, rng: np.random.Generator) -> Array | None:
-    """The disagreement, [], beyond which branches are cut: what the models have on real steps that they did not see."""
+    """The disagreement, [], beyond which branches are cut: the models' on held-out real steps, at least a little."""
     if not config.actor_critic.trust:
         return None
     rows = rng.integers(dataset.validation.size, size=_COMPARED)
     real = _disagreement(ensemble, dataset.validation.states[rows], dataset.validation.actions[rows])
-    return jnp.float32(config.actor_critic.trust * np.quantile(real, _MOST))
+    return jnp.float32(max(config.actor_critic.trust * np.quantile(real, _MOST), config.actor_critic.agreement))
 
 
 def _values(
