@@ -201,14 +201,16 @@ def test_long_horizon_changes_what_its_row_says_and_nothing_else(task):
         ("mbbl/HalfCheetah", {}, "actor-critic"),
         ("Pendulum-v1", {}, "me-trpo"),
         ("Swimmer", {}, "me-trpo"),
-        ("HumanoidStandup", {}, "me-trpo"),
+        ("Hopper", {}, "me-trpo"),
+        ("Humanoid", {}, "actor-critic"),
+        ("HumanoidStandup", {}, "actor-critic"),
         ("Ant", {}, "actor-critic"),
         ("Ant", {"improver": "trpo"}, "me-trpo"),
         ("HalfCheetah-v5", {"improver": "ppo"}, "me-trpo"),
         ("HalfCheetah-v5", {"max_change": 0.5}, "me-trpo"),
     ],
 )
-def test_long_episodes_and_ant_have_another_usual_system(task, settings, system):
+def test_long_episodes_and_some_tasks_have_another_usual_system(task, settings, system):
     assert preset(task, **settings).system == system
     assert configured(task, "fast", None, settings).system == system
     words = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]

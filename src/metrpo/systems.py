@@ -28,7 +28,7 @@ _SVG: Overrides = {
 ACTOR_CRITIC: Overrides = {
     "improver": "actor-critic",
     "actor_critic.agreement": 0.2,
-    "advantage.discount": 0.99,
+    "advantage.discount": 0.995,
     "collect.piece": 50,
     "collect.steps": 250,
     "collect.validation_fraction": 0.1,
