@@ -1,8 +1,9 @@
 """Stable-Baselines3's SAC as a model-free line beside the actor-critic in the ensemble.
 
-`PYTHON benchmarks/soft_actor_critic.py TASK [--seed 0] [--real-steps 100000] [--out DIR]`, with a Python that has
-metrpo and stable-baselines3: its defaults, on the task's own environment, an evaluation without noise every 1,000 real
-steps. Written to DIR (results/sac/TASK/seed-SEED): metrics.csv, and about.json with versions and commit.
+`PYTHON benchmarks/soft_actor_critic.py TASK [--seed 0] [--real-steps 100000] [--env-kwargs KEY=VALUE ...] [--out DIR]`,
+with a Python that has metrpo and stable-baselines3: its defaults, on the task's own environment, an evaluation without
+noise every 1,000 real steps. Written to DIR (results/sac/TASK/seed-SEED): metrics.csv, and about.json with versions
+and commit.
 """
 
 from __future__ import annotations
@@ -33,14 +34,21 @@ def main() -> None:
     parser.add_argument("task")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--real-steps", type=int, default=100_000)
+    parser.add_argument("--env-kwargs", nargs="*", default=[], metavar="KEY=VALUE")
     parser.add_argument("--out", type=Path)
     given = parser.parse_args()
-    task = get_task(given.task)
+    task = get_task(given.task, given.env_kwargs)
     out = given.out or Path("results") / "sac" / folder_name(task.name) / f"seed-{given.seed}"
     out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     versions = {name: version(name) for name in ("stable-baselines3", "torch", "gymnasium", "mujoco")}
-    about = {"task": task.name, "seed": given.seed, "commit": source_commit(), "versions": versions}
+    about = {
+        "task": task.name,
+        "env_kwargs": given.env_kwargs,
+        "seed": given.seed,
+        "commit": source_commit(),
+        "versions": versions,
+    }
     (out / "about.json").write_text(json.dumps(about, indent=1) + "\n")
     model, begun = SAC("MlpPolicy", environment(task), seed=given.seed, device="cpu"), time.perf_counter()
     with (out / "metrics.csv").open("w", newline="") as file:
@@ -56,8 +64,11 @@ def main() -> None:
 
 
 def environment(task: Task) -> gymnasium.Env:
-    """The task's environment, with an end by the time limit said apart, as SAC wants it."""
-    return gymnasium.wrappers.TimeLimit(task.make_env(), task.horizon)
+    """The task's environment as SAC wants it: without global positions, and the end by the time limit said apart."""
+    env = gymnasium.wrappers.TimeLimit(task.make_env(), task.horizon)
+    low, high = (np.delete(x, task.unseen) for x in (env.observation_space.low, env.observation_space.high))
+    space = gymnasium.spaces.Box(low, high, dtype=env.observation_space.dtype)
+    return gymnasium.wrappers.TransformObservation(env, lambda observed: np.delete(observed, task.unseen), space)
 
 
 def evaluated(model: SAC, task: Task, seed: int) -> list[float]:
