@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from metrpo.config import Config
 
 
@@ -29,6 +31,15 @@ def finished(config: Config, iteration: int, real_steps: int) -> bool:
 def spent(config: Config, rows: Sequence[Mapping[str, float | None]]) -> bool:
     """Whether a run with these rows of metrics has used up its budget."""
     return bool(rows) and finished(config, int(rows[-1]["iteration"] or 0), int(rows[-1]["real_steps"] or 0))
+
+
+def seconds_of_next(seconds: Sequence[float]) -> float | None:
+    """How long the next iteration will take, by the median of the last three; None where that cannot be told.
+
+    `seconds` are those of all iterations so far. They grow with the data, and the first one compiles.
+    """
+    recent = np.asarray(seconds[1:][-3:])
+    return float(np.median(recent)) if len(recent) and np.isfinite(recent).all() else None
 
 
 def iterations_left(config: Config, iteration: int, real_steps: int) -> int | None:

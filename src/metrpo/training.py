@@ -14,8 +14,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from metrpo import budget
 from metrpo.algorithm import Log, Row
 from metrpo.callbacks import Callback, Callbacks
@@ -203,12 +201,11 @@ def _loop(
 
 
 def seconds_left(seconds: Sequence[float], iterations: int | None) -> float | None:
-    """About how long `iterations` take, by the last three: they grow with the data. The first one compiles."""
+    """About how long `iterations` take, after some that took so many seconds; None where that cannot be told."""
     if iterations == 0:
         return 0.0
-    if iterations is None or len(seconds) < 2:
-        return None
-    return iterations * float(np.mean(seconds[1:][-3:]))
+    each = budget.seconds_of_next(seconds)
+    return None if iterations is None or each is None else iterations * each
 
 
 def _iterations_left(config: Config, state: Saved) -> int | None:

@@ -16,9 +16,6 @@ from metrpo.checks.health import examine
 from metrpo.run.episodes import waiting_steps
 from metrpo.run.find import SeenRun, is_finished, told_apart
 
-_RECENT = 3
-"""Number of last iterations whose median duration predicts the next ones (durations grow with the data)."""
-
 
 @dataclass(frozen=True)
 class RunStatus:
@@ -138,11 +135,7 @@ def _total(run: SeenRun) -> int | None:
 
 def _seconds(run: SeenRun) -> float | None:
     """Seconds of the next iteration, predicted from the last ones; None without a clock."""
-    wall = np.append(0.0, run.column("wall_seconds"))[-_RECENT - 1 :]
-    steps = np.diff(wall)
-    if len(steps) == len(run.rows) > 1:
-        steps = steps[1:]  # the first one compiled
-    return float(np.median(steps)) if len(steps) and np.isfinite(steps).all() else None
+    return budget.seconds_of_next(np.diff(run.column("wall_seconds"), prepend=0.0).tolist())
 
 
 def _written(folder: Path) -> float | None:
