@@ -109,28 +109,37 @@ def improve_policy(
         rows = rng.integers(dataset.train.size, size=(block, config.actor_critic.real_batch))
         steps = jax.tree.map(lambda x, rows=rows: x[rows], real_steps)
         keys = jax.random.split(jax.random.fold_in(key, number), block)
-        learner, happened = run_block(settings, simulator, learner, starts, steps, keys)
-        infos.append(jax.device_get(happened))
+        learner, info = run_block(settings, simulator, learner, starts, steps, keys)
+        infos.append(jax.device_get(info))
         progress.update((number + 1) * block, _note(infos[-1][0]))
     learner = jax.device_get(learner)
-    updates, imagined = jax.tree.map(lambda *xs: np.concatenate(xs), *infos)
+    happened = jax.tree.map(lambda *xs: np.concatenate(xs), *infos)
     seen = dataset.train.states[-_LOOKED_AT:]
     policies = [squashed.mean_policy(x.actor, inputs, seen) for x in (before, learner)]
     with clock("validate"):
         values = _values(config, simulator, policies, dataset.starts, jax.random.fold_in(key, _JUDGE))
-    shown = normalised(inputs, seen)
-    info = PhaseInfo(
-        values=values[1],
-        updates=blocks * block,
-        accepted_updates=blocks * block,
-        rejected_steps=int(np.sum(~updates.accepted)),
+    distance = squashed.kl(squashed.on_host(before.actor), learner.actor, normalised(inputs, seen))
+    more = _columns(happened[0], learner, policies[1], seen)
+    return policies[1], learner, _phase_info(happened, values, distance, more)
+
+
+def _phase_info(
+    happened: tuple[UpdateInfo, ImagineInfo], values: list[np.ndarray], distance: np.ndarray, more: dict[str, float]
+) -> PhaseInfo:
+    """Of all updates: `values` [2, K] of the policy before and after them, and its `distance` between (KL)."""
+    (made, imagined), (before, after) = happened, values
+    count = len(made.accepted)
+    return PhaseInfo(
+        values=after,
+        updates=count,
+        accepted_updates=count,
+        rejected_steps=int(np.sum(~made.accepted)),
         validations=1,
-        improved=improved(values[1], values[0]).astype(np.float64),
-        kl=float(np.mean(squashed.kl(squashed.on_host(before.actor), learner.actor, shown))) / (blocks * block),
+        improved=improved(after, before).astype(np.float64),
+        kl=float(np.mean(distance)) / count,
         diverged=float(np.mean(imagined.diverged)),
-        more=_columns(updates, learner, policies[1], seen),
+        more=more,
     )
-    return policies[1], learner, info
 
 
 def _blocks(config: Config, real_steps: int) -> int:
