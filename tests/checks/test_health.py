@@ -107,6 +107,15 @@ def test_a_policy_that_earns_less_than_nothing_does_is_told():
     assert set(found) <= other
 
 
+def test_a_task_solved_at_once_is_no_warning():
+    rows = changed(1, return_real=500.0, return_real_std=1.0, gap=0.0)
+    levels = [
+        [c.level for c in examine(rows, CONFIG, yardsticks) if c.code == "no-improvement"]
+        for yardsticks in ({}, {"doing nothing": 499.9}, {"doing nothing": 5.0, "random actions": -3.0})
+    ]
+    assert levels == [["warning"], ["warning"], ["note"]]
+
+
 def test_every_check_has_a_case():
     fired = {check.__name__ for check in CHECKS for _, rows, config, *_ in CASES if check(rows, config)}
     assert fired == {check.__name__ for check in CHECKS}

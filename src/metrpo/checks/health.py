@@ -21,7 +21,6 @@ CHECKS: tuple[Callable[[Sequence[Row], Config], Concern | None], ...] = (
     model_checks.model_exploited,
     policy_checks.not_evaluated,
     policy_checks.return_fell,
-    policy_checks.no_improvement,
     model_checks.diverged,
     policy_checks.updates_rejected,
     policy_checks.std_collapsed,
@@ -37,6 +36,8 @@ CHECKS: tuple[Callable[[Sequence[Row], Config], Concern | None], ...] = (
     policy_checks.failed_episodes,
 )
 """To add a check, add a row."""
+COMPARED = (policy_checks.no_improvement, policy_checks.no_skill)
+"""Those that also ask what no skill earns."""
 
 
 def examine(
@@ -49,6 +50,7 @@ def examine(
     if not rows:
         return []
     with np.errstate(all="ignore"):  # a check of its own reports what is not finite
-        results = [*(check(rows, config) for check in CHECKS), policy_checks.no_skill(rows, config, yardsticks)]
-    concerns = [concern for concern in results if concern is not None]
+        measured = [check(rows, config) for check in CHECKS]
+        compared = [check(rows, config, yardsticks) for check in COMPARED]
+    concerns = [concern for concern in (*compared, *measured) if concern is not None]
     return sorted(concerns, key=lambda concern: concern.level != "warning")

@@ -89,14 +89,15 @@ def failed_episodes(rows: Sequence[Row], config: Config) -> Concern | None:
     )
 
 
-def no_improvement(rows: Sequence[Row], config: Config) -> Concern | None:
-    """No iteration is better than the first."""
+def no_improvement(rows: Sequence[Row], config: Config, yardsticks: Mapping[str, float]) -> Concern | None:
+    """No iteration is better than the first: a remark only, where that one was clearly better than no skill."""
     real, error = column(rows, "return_real"), standard_error(rows, config)
     if len(real) < FLAT or not np.isfinite(real).all() or real[1:].max() > real[0] + 2 * error[0]:
         return None
+    skilled = bool(yardsticks) and real[0] > max(yardsticks.values()) + 2 * error[0]
     return Concern(
         "no-improvement",
-        "warning",
+        "note" if skilled else "warning",
         int(iteration_at(rows, 0)),
         f"No return above the first one, {short(real[0])}, in {counted(len(real), 'iteration')}",
         "the task was solved at once, or nothing is learned",
