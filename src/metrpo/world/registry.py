@@ -97,7 +97,7 @@ def _with_formulas(name: str, env_kwargs: tuple[str, ...]) -> Task:
         unseen=known.unseen,
         description=known.description,
     )
-    task = dataclasses.replace(task, reward_error=known.reward_error)
-    if not (known.added and task.interface):
-        return task
-    return dataclasses.replace(task, interface=with_positions(task.interface, name, known.added))
+    interface = task.interface
+    if known.added and interface:
+        interface = with_positions(interface, name, known.added)
+    return dataclasses.replace(task, interface=interface, reward_error=known.reward_error)

@@ -44,8 +44,6 @@ MBBL = [name for name in NAMES if name.startswith("mbbl/")]
 ROBOTS = ["mbbl/HalfCheetah", "mbbl/Swimmer", "mbbl/Hopper", "mbbl/Ant"]
 ENDING = ["MountainCarContinuous-v0", "InvertedPendulum-v5", "InvertedDoublePendulum-v5"]
 HEALTHY = ["Hopper-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5"]
-# MuJoCo's bodies lie where the last of the four stages of its integration saw them, the observed positions are what
-# came out of it: the distance that these two rewards read off bodies is no exact function of the observation.
 
 
 def rescaled(name):
