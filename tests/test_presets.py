@@ -12,7 +12,7 @@ from metrpo.commands.parse import parse
 from metrpo.config import Config, Preset, System, flatten, from_json, to_json
 from metrpo.errors import ConfigError
 from metrpo.launch.grid import Grid
-from metrpo.presets import BY_CRITICS, LONG_HORIZON_ALL, configured, preset
+from metrpo.presets import BY_CRITICS, LONG_HORIZON_ALL, SHORT_BY_CRITICS, configured, preset
 from metrpo.systems import SYSTEMS
 from metrpo.world.registry import tasks
 
@@ -229,10 +229,30 @@ def test_other_presets_have_one_usual_system(name, task):
 def test_a_task_of_the_critics_differs_from_their_system_in_its_row_alone():
     for task, row in BY_CRITICS.items():
         usual, me_trpo = flatten(preset(task)), flatten(preset(task, system="me-trpo"))
-        assert usual == me_trpo | SYSTEMS["actor-critic"] | {"system": "actor-critic"} | row
+        assert usual == me_trpo | SYSTEMS["actor-critic"] | SHORT_BY_CRITICS | {"system": "actor-critic"} | row
         # Who asks for a setting gets it.
         assert preset(task, iterations=3).iterations == 3
         assert not configured(task, "fast", None, {"ensemble.probabilistic": False}).ensemble.probabilistic
+
+
+@pytest.mark.parametrize(
+    ("task", "discount", "episodes"),
+    [
+        ("Swimmer", 0.99, 20),
+        ("Pendulum-v1", 0.99, 20),
+        ("mbbl/CartPole", 0.99, 20),
+        ("HalfCheetah-v5", 0.995, 3),
+        ("mbbl/HalfCheetah", 0.995, 3),
+    ],
+)
+def test_the_critics_look_as_far_as_episodes_last(task, discount, episodes):
+    config = preset(task, system="actor-critic")
+    assert (config.advantage.discount, config.evaluation_episodes) == (discount, episodes)
+
+
+def test_a_horizon_of_ones_own_decides_how_far_the_critics_look():
+    config = preset("Pendulum-v1", system="actor-critic", env_kwargs={"max_episode_steps": 500})
+    assert config.advantage.discount == 0.995
 
 
 def test_settings_on_top():
@@ -267,6 +287,7 @@ def test_every_system_that_can_be_named_stands_in_the_table():
 def test_a_system_changes_what_its_row_says_and_nothing_else(system, name):
     config = preset("Swimmer", name, system)
     row = SYSTEMS[system] | (systems.PAPER.get(system, {}) if name == "paper" else {})
+    row |= SHORT_BY_CRITICS if system == "actor-critic" else {}  # Swimmer's episodes have 200 steps
     before = flatten(preset("Swimmer", name))
     assert flatten(config) == before | row | {"system": system}
     assert from_json(to_json(config)) == config

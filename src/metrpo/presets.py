@@ -102,15 +102,17 @@ SAME_AS = {"HopperUpright": "Hopper", "HumanoidStandup": "Humanoid"}
 """Variants share their task's row."""
 
 
-_SHORT: Overrides = {"advantage.discount": 0.99, "evaluation_episodes": 20}
-BY_CRITICS: dict[str, Overrides] = {
-    "Ant": _SHORT | {"iterations": 43},  # some 15,000 real steps
-    "Humanoid": _SHORT | {"iterations": 20},  # some 8,700
-}
-"""Tasks of short episodes that the actor-critic learns from fewer real steps: what differs from `SYSTEMS` for them."""
-
 LONG = 300
 """Episodes of more steps are imagined in parts, and valued by critics where these end (docs/actor-critic.md)."""
+
+SHORT_BY_CRITICS: Overrides = {"advantage.discount": 0.99, "evaluation_episodes": 20}
+"""What the actor-critic has where episodes are not that long, on top of `SYSTEMS`."""
+
+BY_CRITICS: dict[str, Overrides] = {
+    "Ant": {"iterations": 43},  # some 15,000 real steps
+    "Humanoid": {"iterations": 20},  # some 8,700
+}
+"""Tasks of short episodes that the actor-critic learns from fewer real steps: what differs for them."""
 
 
 ONLY_ME_TRPO = frozenset({"improver", "method", "max_action", "max_change"})
@@ -123,14 +125,12 @@ def usual_system(task: str, name: str, settings: Mapping[str, Any]) -> System:
 
     Where `settings` say how to learn, or limit the actions (`ONLY_ME_TRPO`), it is `me-trpo`.
     """
-    from metrpo.world.registry import get_task
-
     if name != "fast" or settings.keys() & ONLY_ME_TRPO:
         return "me-trpo"
     row = SAME_AS.get(task, task)
     if row in PAPER:
         return "actor-critic" if row in BY_CRITICS else "me-trpo"
-    return "actor-critic" if get_task(task, **_chosen(settings)).horizon > LONG else "me-trpo"
+    return "actor-critic" if _is_long(task, _chosen(settings)) else "me-trpo"
 
 
 def preset(task: str, name: str = "fast", system: str | None = None, **top_level: Any) -> Config:
@@ -152,7 +152,8 @@ def preset(task: str, name: str = "fast", system: str | None = None, **top_level
         raise ConfigError(f"system: expected one of {', '.join(SYSTEMS)}, got {system!r}")
     overrides = overrides | SYSTEMS[system] | (SYSTEMS_PAPER.get(system, {}) if name == "paper" else {})
     if system == "actor-critic":
-        overrides |= BY_CRITICS.get(row, {})
+        short = row in PAPER or not _is_long(task, _chosen(top_level))
+        overrides |= (SHORT_BY_CRITICS if short else {}) | BY_CRITICS.get(row, {})
     config = Config(task=task, preset=cast(Preset, name))
     return override(config, overrides | {"system": system} | top_level)
 
@@ -173,11 +174,19 @@ def configured(task: str, name: str, system: str | None, settings: Overrides) ->
     return override(bare(task, name, system, settings), settings)
 
 
+def _is_long(task: str, chosen: Overrides) -> bool:
+    return _horizon(task, chosen) > LONG
+
+
+def _horizon(task: str, chosen: Overrides) -> int:
+    from metrpo.world.registry import get_task  # needed only for a task that is not in these tables
+
+    return get_task(task, **chosen).horizon
+
+
 def _generic(task: str, chosen: Overrides) -> Overrides:
     """For a task of the user's own: about five episodes an iteration, validated on about 10,000 steps of each model."""
-    from metrpo.world.registry import get_task  # known only when a task is asked for that is not in these tables
-
-    horizon = get_task(task, **chosen).horizon
+    horizon = _horizon(task, chosen)
     return {
         "iterations": 10,
         "collect.steps": min(max(5 * horizon, 1000), 5000),
