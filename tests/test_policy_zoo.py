@@ -93,12 +93,15 @@ def test_the_best_run_that_shows_skill_is_chosen(tmp_path, monkeypatch):
     left("c", Config("Swimmer", seed=2, method="trpo", system="trpo"), [50.0])
     left("d", Config("Snake"), [-2.0])
     out = tmp_path / "zoo"
-    (out / "Old").mkdir(parents=True)
+    for before in ("Ant", "Snake", "Swimmer"):
+        (out / before).mkdir(parents=True)
+        (out / before / "old").touch()
     lines = fill_zoo.fill([tmp_path / "runs"], out, {"Snake": {"zero": {"mean": -1.7}}})
     assert lines == ["left out Snake: -2.0, and no skill earns -1.7", "zoo:Swimmer: 7.0, the best of 2 runs"]
     card = json.loads((out / "Swimmer" / "card.json").read_text())
     assert (card["return"], card["mean_of_runs"], card["commit"], card["created"]) == (7.0, 5.0, "abc", "2026-01-02")
     assert card["curve"] == [[100, 1.0], [200, 9.0], [300, 7.0]]
     assert metrpo.load_policy(out / "Swimmer").info.action_low == (-1.0, -1.0)
-    assert [path.name for path in out.iterdir()] == ["Swimmer"], "what was there is gone"
+    assert sorted(path.name for path in out.iterdir()) == ["Ant", "Swimmer"], "of these tasks, what was there is gone"
+    assert not (out / "Swimmer" / "old").exists()
     sys.modules.pop("fill_zoo")

@@ -2,7 +2,8 @@
 
 For each task that can be played by its name, the policy with the best real return in its run's last evaluation, of all
 model-based runs under the folders (default: results/); not one that earns no more than doing nothing or random actions.
-Writes `src/metrpo/zoo_policies/` anew, policies in today's format and a card each. Run it again when runs are added.
+Writes policies in today's format, and a card each, to `src/metrpo/zoo_policies/`: all anew by default, else those of
+the folders' tasks. Run it again when runs are added.
 """
 
 from __future__ import annotations
@@ -62,10 +63,10 @@ def add(runs: list[SeenRun], floor: float | None, folder: Path) -> None:
 
 
 def fill(folders: list[Path], out: Path, measured: dict[str, Any]) -> list[str]:
-    """Writes the zoo anew to `out`; returns a line for each task."""
-    shutil.rmtree(out, ignore_errors=True)
+    """Writes the policies of the folders' tasks anew to `out`; returns a line for each task."""
     lines = []
     for task, runs in candidates(folders).items():
+        shutil.rmtree(out / folder_name(task), ignore_errors=True)
         best, floor = max(_return(run) or -np.inf for run in runs), no_skill(runs[0], measured)
         if floor is not None and best <= floor:
             lines.append(f"left out {task}: {best:.1f}, and no skill earns {floor:.1f}")
@@ -95,6 +96,9 @@ def _return(run: SeenRun) -> float | None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", type=Path, nargs="*", default=[RESULTS])
+    parser.add_argument("folders", type=Path, nargs="*")
     given = parser.parse_args()
-    print("\n".join(fill(given.folders, zoo.FOLDER, json.loads((RESULTS / "yardsticks.json").read_text()))))
+    if not given.folders:
+        shutil.rmtree(zoo.FOLDER, ignore_errors=True)
+    yardsticks = json.loads((RESULTS / "yardsticks.json").read_text())
+    print("\n".join(fill(given.folders or [RESULTS], zoo.FOLDER, yardsticks)))
