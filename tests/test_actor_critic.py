@@ -25,6 +25,7 @@ from metrpo.run.metrics import read_metrics
 from metrpo.run.policy_export import export
 from metrpo.run.policy_file import load_policy
 from metrpo.stages import actor_critic_search
+from metrpo.stages.ensemble_fit import ensemble_of
 from metrpo.stages.state import inputs_for
 from metrpo.training import train
 
@@ -133,7 +134,7 @@ def test_its_steps_one_at_a_time_are_the_loop_byte_for_byte(tmp_path):
         assert (whole / name).read_bytes() == (steps / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("settings", [{"learn_reward": True}, {"history": 2}, {"actor_critic.horizon": 0}])
+@pytest.mark.parametrize("settings", [{"learn_reward": True, "history": 2}, {"actor_critic.horizon": 0}])
 def test_it_learns_rewards_sees_the_past_and_does_without_imagined_steps(settings, tmp_path):
     train(override(SMALL, {"iterations": 2, **settings}), tmp_path)
     row = read_metrics(tmp_path / "metrics.csv")[-1]
@@ -200,14 +201,15 @@ def test_models_are_trusted_as_far_as_they_agree_on_most_of_the_held_out_steps(s
 
 
 def test_what_it_learns_does_not_depend_on_the_unit_of_rewards(small):
-    ensemble = linear_ensemble([(probe.A * factor, probe.B) for factor in (0.9, 1.1)])
-    state = small.states[0]._replace(dataset=small.states[1].dataset)
+    before, after = small.states[:2]
+    state = before._replace(dataset=after.dataset)
+    ensemble = ensemble_of(SMALL, probe.PROBE, after.networks, after.dataset.train)
 
-    def learned(unit):
-        task = dataclasses.replace(probe.PROBE, reward=lambda *step: unit * probe.reward(*step))
+    def learned(task):
         return actor_critic_search.improve_policy(SMALL, task, state, ensemble, Progress(), Clock())[:2]
 
-    (policy, learner), (same, other) = learned(1), learned(64)
+    larger = dataclasses.replace(probe.PROBE, reward=lambda *step: 64 * probe.reward(*step))
+    (policy, learner), (same, other) = learned(probe.PROBE), learned(larger)
     assert not equal(policy, state.policy)
     for one, two in zip(jax.tree.leaves(policy), jax.tree.leaves(same), strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-4, atol=1e-5)

@@ -291,15 +291,24 @@ def test_without_imagined_steps_it_is_soft_actor_critic():
 # ---------------------------------------------------------------- what is not finite
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_an_update_that_is_not_finite_changes_nothing(value):
-    def spoilt(act, begin, key):
+@pytest.fixture(scope="module")
+def poisoned():
+    def spoilt(poison, act, begin, key):
         rollouts, info = simulate(simulator(2), act, begin, key)
-        return rollouts._replace(rewards=rollouts.rewards.at[1, 2].multiply(poison[0])), info
+        return rollouts._replace(rewards=rollouts.rewards.at[1, 2].multiply(poison)), info
 
-    poison = [value]
+    compiled = jax.jit(lambda poison, *given: update(SETTINGS, partial(spoilt, poison), *given))
+    return lambda one, poison: compiled(poison, one, starts(), real_steps(), KEY)
+
+
+def test_an_update_with_a_finite_factor_is_accepted(poisoned):
+    assert poisoned(learner(), 1.0)[1].accepted
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_an_update_that_is_not_finite_changes_nothing(value, poisoned):
     one = learner()
-    new, info, _ = jax.jit(partial(update, SETTINGS, spoilt))(one, starts(), real_steps(), KEY)
+    new, info, _ = poisoned(one, value)
     assert not info.accepted
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(info))
     for got, before in zip(jax.tree.leaves(new), jax.tree.leaves(one), strict=True):
