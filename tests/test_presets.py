@@ -202,6 +202,7 @@ def test_long_horizon_changes_what_its_row_says_and_nothing_else(task):
         ("Pendulum-v1", {}, "me-trpo"),
         ("Swimmer", {}, "me-trpo"),
         ("Hopper", {}, "me-trpo"),
+        ("Snake", {}, "actor-critic"),
         ("Humanoid", {}, "actor-critic"),
         ("HumanoidStandup", {}, "actor-critic"),
         ("Ant", {}, "actor-critic"),
