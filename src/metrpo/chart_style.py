@@ -1,11 +1,13 @@
-"""The one look of all charts: colours and axes."""
+"""The one look of all charts: colours, axes and files."""
 
 from __future__ import annotations
 
+import io
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 BLUE, ORANGE, GREEN, RED, VIOLET, BROWN = COLOURS = ("#1f5fa8", "#d9772b", "#3f8f5f", "#b0413e", "#7a5aa6", "#8a6d3b")
 """Of groups of runs, in this order."""
@@ -19,3 +21,19 @@ def tidy(axes: Axes) -> None:
     axes.grid(True, color="#dddddd", linewidth=0.7)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def png_of(figure: Figure) -> bytes:
+    """The figure as a PNG of at most 256 colours: the same to the eye, in a third of the bytes.
+
+    The same figure gives the same bytes.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image  # comes with matplotlib
+
+    canvas, content = FigureCanvasAgg(figure), io.BytesIO()
+    canvas.draw()
+    drawn = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba()).convert("RGB")
+    few = drawn.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    few.save(content, "PNG", optimize=True, dpi=(figure.dpi, figure.dpi))
+    return content.getvalue()

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from metrpo.chart_style import COLOURS, GREY, IMAGINED, REAL, tidy
+from metrpo.chart_style import COLOURS, GREY, IMAGINED, REAL, png_of, tidy
 from metrpo.launch.run_spec import RunSpec
 from metrpo.paper.figures import FIGURES, PAPER_REAL_STEPS, PAPER_SECONDS, Figure
 from metrpo.paper.summary import Curves, curves_of, mean_curve
@@ -36,9 +35,7 @@ def draw(name: str, runs: Sequence[RunSpec], out: Path, path: Path) -> bool:
     picture = Picture(dpi=130, layout="constrained")
     _KINDS[FIGURES[name].kind](picture, FIGURES[name], curves)
     picture.suptitle(FIGURES[name].title, fontsize=13, fontweight="bold")
-    content = io.BytesIO()
-    picture.savefig(content, format="png", metadata={"Software": None})
-    atomic_write(path, content.getvalue())
+    atomic_write(path, png_of(picture))
     return True
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from metrpo.chart_style import COLOURS, tidy
+from metrpo.chart_style import COLOURS, png_of, tidy
 from metrpo.counting import counted
 from metrpo.errors import ConfigError
 from metrpo.plots.bands import RATIOS, curve, is_far
@@ -20,6 +20,7 @@ from metrpo.run.find import SeenRun, group
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 X = Literal["real_steps", "wall_seconds", "iteration"]
 AxisScale = Literal["auto", "linear", "log"]
@@ -86,7 +87,6 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
         raise ConfigError(f"out: expected a file name that ends in .png, .svg or .pdf, got {path}")
     _require_column(runs, "y", y)
     _require_column(runs, "x", x)
-    import matplotlib
     from matplotlib.figure import Figure  # slow to import
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
@@ -137,13 +137,18 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
         figure.suptitle(look.title, fontsize=13, parse_math=False)
     for axes in panels[len(tasks) :]:
         axes.set_axis_off()
-    picture = io.BytesIO()
-    # The same runs give the same bytes: no date, and no random names inside of an SVG.
-    nothing = {"png": {"Software": None}, "svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind]
-    with matplotlib.rc_context({"svg.hashsalt": "metrpo"}):
-        figure.savefig(picture, format=kind, metadata=nothing)
-    atomic_write(path, picture.getvalue())
+    atomic_write(path, png_of(figure) if kind == "png" else _vectors(figure, kind))
     return path
+
+
+def _vectors(figure: Figure, kind: str) -> bytes:
+    """As an SVG or PDF; the same figure gives the same bytes: no date, and no random names inside of an SVG."""
+    import matplotlib
+
+    content = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "metrpo"}):
+        figure.savefig(content, format=kind, metadata={"svg": {"Date": None}, "pdf": {"CreationDate": None}}[kind])
+    return content.getvalue()
 
 
 def _add_legend(axes: Axes, where: Legend, room: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from metrpo.chart_style import GREEN, GREY, IMAGINED, REAL, tidy
+from metrpo.chart_style import GREEN, GREY, IMAGINED, REAL, png_of, tidy
 from metrpo.counting import counted
 from metrpo.run.files import atomic_write
 from metrpo.run.metrics import Row, column
@@ -52,9 +51,7 @@ def draw_curve(rows: Sequence[Row], path: Path, title: str, yardsticks: Mapping[
         tidy(axes)
     below.set_xlabel("real steps (thousands)")
     below.set_xlim(left=0)
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", metadata={"Software": None})
-    atomic_write(path, picture.getvalue())
+    atomic_write(path, png_of(figure))
 
 
 def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row], yardsticks: Mapping[str, float]) -> None:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from metrpo.chart_style import BLUE, GREEN, ORANGE, RED, tidy
+from metrpo.chart_style import BLUE, GREEN, ORANGE, RED, png_of, tidy
 from metrpo.counting import counted
 from metrpo.run.files import atomic_write
 from metrpo.tune.results import Record, Tuned
@@ -48,9 +47,7 @@ def draw(tuned: Tuned, path: Path) -> bool:
     figure.legend(loc="outside lower center", ncols=5, frameon=False, fontsize=9)
     title = f"{tuned.search.task}: {counted(len(tuned.records), 'trial')} of {counted(len(tuned.search.seeds), 'seed')}"
     figure.suptitle(title, fontsize=12, fontweight="bold", parse_math=False)
-    content = io.BytesIO()
-    figure.savefig(content, format="png", metadata={"Software": None})
-    atomic_write(path, content.getvalue())
+    atomic_write(path, png_of(figure))
     return True
 
 
