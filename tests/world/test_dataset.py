@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -99,6 +101,36 @@ def test_deltas_are_exact_differences_and_rows_belong_together():
             np.testing.assert_array_equal(a, rows[s.tobytes()][0])
             np.testing.assert_array_equal(delta, rows[s.tobytes()][1].astype(np.float32))
         assert {x.dtype for x in t[:3]} == {np.dtype(np.float32)}
+
+
+@given(st.integers(1, 12), st.integers(1, 12), st.booleans())
+@settings(max_examples=60, deadline=None)
+def test_pieces_put_together_are_the_episode(length, longest, terminated):
+    (episode,) = numbered_episodes([length])
+    episode = episode._replace(rewards=np.arange(length, dtype=np.float32), terminated=terminated)
+    parts = datasets.pieces(episode, longest)
+    assert [len(p.rewards) for p in parts[:-1]] == [longest] * (len(parts) - 1)
+    assert 1 <= len(parts[-1].rewards) <= longest
+    for p in parts:
+        assert len(p.states) == len(p.actions) + 1 == len(p.rewards) + 1
+    for name in ("states", "actions", "rewards"):
+        starts = np.concatenate([getattr(p, name)[: len(p.rewards)] for p in parts])
+        np.testing.assert_array_equal(starts, getattr(episode, name)[:length])
+    for one, following in pairwise(parts):
+        np.testing.assert_array_equal(one.states[-1], following.states[0])
+    np.testing.assert_array_equal(parts[-1].states[-1], episode.states[-1])
+    assert [p.terminated for p in parts] == [False] * (len(parts) - 1) + [terminated]
+
+
+def test_pieces_are_what_is_split_and_only_whole_episodes_are_started_from():
+    config = CollectConfig(validation_fraction=0.5, piece=4)
+    dataset = datasets.add(datasets.empty(3, 2), numbered_episodes([10, 8]), config, np.random.default_rng(0))
+    train, validation = split_of(dataset)
+    assert sum(map(len, validation.values())) in (6, 8), "two of five pieces"
+    steps = sorted((n, step) for split in (train, validation) for n, found in split.items() for step in found)
+    assert steps == [(0, i) for i in range(10)] + [(1, i) for i in range(8)]
+    np.testing.assert_array_equal(dataset.starts[:, :2], [[0, 0], [1, 0]])
+    assert set(train) & set(validation), "an episode has pieces on either side"
 
 
 def test_no_transition_leads_from_one_episode_into_the_next():

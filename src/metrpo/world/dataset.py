@@ -78,15 +78,14 @@ def add(
 def pieces(episode: Episode, longest: int) -> list[Episode]:
     """The episode cut into parts of at most `longest` steps, as episodes of their own."""
     length = len(episode.rewards)
-    firsts = range(0, length, longest)
     return [
         Episode(
-            episode.states[i : min(i + longest, length) + 1],
-            episode.actions[i : i + longest],
-            episode.rewards[i : i + longest],
-            episode.terminated and i + longest >= length,
+            episode.states[first : end + 1],
+            episode.actions[first:end],
+            episode.rewards[first:end],
+            episode.terminated and end >= length,
         )
-        for i in firsts
+        for first, end in ((i, i + longest) for i in range(0, length, longest))
     ]
 
 
