@@ -86,6 +86,32 @@ def test_an_iteration_makes_an_update_for_each_real_step_that_it_collects(small)
     assert [row["updates"] for row in small.rows] == [20, 10, 10, 10]
 
 
+def test_whole_episodes_that_bring_more_steps_than_asked_for_bring_more_updates():
+    class Told(Progress):
+        def __init__(self):
+            self.heard = []
+
+        def stage(self, name, total=None):
+            self.heard.append((name, total))
+
+        def update(self, done, note=""):
+            self.heard.append(done)
+
+    told, config = Told(), override(SMALL, {"collect.steps": 21, "iterations": 2})
+    state = training.init(config)
+    for steps, updates in ((40, 20), (40, 20)):
+        state, row = training.step(config, state, told)
+        assert (row["real_steps"] - 40 * (state.iteration - 1), row["updates"]) == (steps, updates)
+    begun = told.heard.index(("improve", 20))
+    assert told.heard[begun + 1 : begun + 3] == [10, 20], "the bar is full when all is done"
+
+
+def test_a_log_alone_is_learned_from_as_if_the_settings_steps_were_new():
+    assert actor_critic_search.updates_for(SMALL, 0) == 10
+    assert actor_critic_search.updates_for(SMALL, 400) == 200
+    assert actor_critic_search.updates_for(SMALL, 1) == 10, "a block at least"
+
+
 def test_rows_say_what_was_learned(small):
     for row in small.rows:
         for name in ("critic_loss", "value", "entropy", "entropy_weight", "actor_gradient_norm", "saturated", "kl"):

@@ -106,13 +106,13 @@ def learn(
         ensemble, fitted = fit_ensemble(config, task, state.networks, state.dataset, iteration, progress)
         require_finite("fit", iteration, "start anew with a lower fit.learning_rate", **ensemble._asdict())
     with clock("improve"):
-        progress.stage("improve", config.validate.max_updates)
-        policy, baseline, improved = improve_policy(config, task, state, ensemble, progress, clock)
+        steps = sum(len(e.rewards) for e in episodes)
+        policy, baseline, improved = improve_policy(config, task, state, ensemble, progress, clock, steps)
         advice = "training cannot continue from this state: use smaller steps or start anew"
         require_finite("improve", iteration, advice, policy=policy, baseline=baseline)
     candidate = State(
         iteration=iteration,
-        real_steps=state.real_steps + sum(len(e.rewards) for e in episodes),
+        real_steps=state.real_steps + steps,
         policy=policy,
         previous_policy=state.policy if improved.accepted_updates else state.previous_policy,
         networks=ensemble.networks,

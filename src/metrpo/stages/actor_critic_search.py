@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from metrpo import budget
 from metrpo.actor_critic_phase import branches, run_block
 from metrpo.config import Config
 from metrpo.console.progress import Progress
@@ -83,9 +82,9 @@ def explorer(config: Config, task: Task, state: State) -> Callable[[np.random.Ge
 
 
 def improve_policy(
-    config: Config, task: Task, state: State, ensemble: Ensemble, progress: Progress, clock: Clock
+    config: Config, task: Task, state: State, ensemble: Ensemble, progress: Progress, clock: Clock, steps: int = 0
 ) -> tuple[Policy, Learner, PhaseInfo]:
-    """The policy after an iteration's updates, the learner and what happened.
+    """The policy after the updates of an iteration that collected `steps` real steps, the learner and what happened.
 
     `state` holds the dataset that the ensemble was fitted to.
     """
@@ -103,13 +102,13 @@ def improve_policy(
         states=normalised(inputs, real_steps.states), following=normalised(inputs, real_steps.following)
     )
     infos: list[tuple[UpdateInfo, ImagineInfo]] = []
-    block, blocks = config.actor_critic.block, _blocks(config, state.real_steps)
-    for number in range(blocks):
+    block = config.actor_critic.block
+    for number in range(updates_for(config, steps) // block):
         starts = dataset.train.states[rng.integers(dataset.train.size, size=branches(settings, block))]
         rows = rng.integers(dataset.train.size, size=(block, config.actor_critic.real_batch))
-        steps = jax.tree.map(lambda x, rows=rows: x[rows], real_steps)
+        drawn = jax.tree.map(lambda x, rows=rows: x[rows], real_steps)
         keys = jax.random.split(jax.random.fold_in(key, number), block)
-        learner, info = run_block(settings, simulator, learner, starts, steps, keys)
+        learner, info = run_block(settings, simulator, learner, starts, drawn, keys)
         infos.append(jax.device_get(info))
         progress.update((number + 1) * block, _note(infos[-1][0]))
     learner = jax.device_get(learner)
@@ -142,10 +141,13 @@ def _phase_info(
     )
 
 
-def _blocks(config: Config, real_steps: int) -> int:
-    """Blocks of updates in the iteration that begins after `real_steps`."""
-    updates = config.actor_critic.updates_per_step * (budget.steps_wanted(config, real_steps) or config.collect.steps)
-    return max(1, round(updates / config.actor_critic.block))
+def updates_for(config: Config, steps: int) -> int:
+    """The updates of an iteration that collected `steps` real steps, in whole blocks.
+
+    Where there is a log alone and nothing is collected, as many as for `collect.steps`.
+    """
+    a = config.actor_critic
+    return a.block * max(1, round(a.updates_per_step * (steps or config.collect.steps) / a.block))
 
 
 def _in_units(state: State, scale: ValueScale, discount: float) -> Learner:

@@ -68,11 +68,11 @@ def perturbed(
 
 
 def improve_policy(
-    config: Config, task: Task, state: State, ensemble: Ensemble, progress: Progress, clock: Clock
+    config: Config, task: Task, state: State, ensemble: Ensemble, progress: Progress, clock: Clock, steps: int = 0
 ) -> tuple[Policy, Baseline, PhaseInfo]:
     """The policy phase (`metrpo.policy_phase`): the accepted policy, its baseline and what happened.
 
-    `state` holds the dataset that the ensemble was fitted to.
+    `state` holds the dataset that the ensemble was fitted to. How many real `steps` are new does not matter here.
     """
     iteration, dataset = state.iteration + 1, state.dataset
     rng = rng_of(config.seed, iteration, Stage.IMPROVE)

@@ -35,9 +35,12 @@ class ImprovePolicy(Protocol):
     """The signature of every search."""
 
     def __call__(
-        self, config: Config, task: Task, state: State, ensemble: Ensemble, progress: Progress, clock: Clock
+        self, config: Config, task: Task, state: State, ensemble: Ensemble, progress: Progress, clock: Clock, steps: int
     ) -> tuple[Policy, Baseline, PhaseInfo]:
-        """The policy, what it learns with and what happened; `state` holds the data that the ensemble is fitted to."""
+        """The policy, what it learns with and what happened.
+
+        `state` holds the data that the ensemble is fitted to; the iteration collected `steps` real steps of it.
+        """
 
 
 class PolicySearch(NamedTuple):
@@ -46,17 +49,23 @@ class PolicySearch(NamedTuple):
     fresh: Fresh
     explorer: Explorer
     improve: ImprovePolicy
+    most_updates: Callable[[Config, int], int]
+    """(config, real steps that the iteration collected) -> the updates that it makes at most."""
 
 
-_IN_PHASES = PolicySearch(in_phases.fresh, in_phases.explorer, in_phases.improve_policy)
+_IN_PHASES = PolicySearch(
+    in_phases.fresh, in_phases.explorer, in_phases.improve_policy, lambda config, steps: config.validate.max_updates
+)
 """The paper's: updates on imagined episodes until the models no longer agree that the policy improves."""
-_BY_CRITICS = PolicySearch(by_critics.fresh, by_critics.explorer, by_critics.improve_policy)
+_BY_CRITICS = PolicySearch(by_critics.fresh, by_critics.explorer, by_critics.improve_policy, by_critics.updates_for)
 SEARCHES: dict[str, PolicySearch] = {**dict.fromkeys(IMPROVERS, _IN_PHASES), "actor-critic": _BY_CRITICS}
 """By `Config.improver`."""
 
 
 def improve_policy(
-    config: Config, task: Task, state: State, ensemble: Ensemble, progress: Progress, clock: Clock
+    config: Config, task: Task, state: State, ensemble: Ensemble, progress: Progress, clock: Clock, steps: int
 ) -> tuple[Policy, Baseline, PhaseInfo]:
-    """As the settings say."""
-    return SEARCHES[config.improver].improve(config, task, state, ensemble, progress, clock)
+    """As the settings say; `progress` hears of it as the stage "improve"."""
+    search = SEARCHES[config.improver]
+    progress.stage("improve", search.most_updates(config, steps))
+    return search.improve(config, task, state, ensemble, progress, clock, steps)
