@@ -7,13 +7,15 @@ import typing
 
 import pytest
 
-from metrpo import systems
+from metrpo import systems, training
 from metrpo.commands.parse import parse
-from metrpo.config import Config, Preset, System, flatten, from_json, to_json
+from metrpo.config import Config, Preset, System, flatten, from_json, require_consistent, to_json
 from metrpo.errors import ConfigError
 from metrpo.launch.grid import Grid
 from metrpo.presets import BY_CRITICS, LONG_HORIZON_ALL, SHORT_BY_CRITICS, configured, preset
 from metrpo.systems import SYSTEMS
+from metrpo.tune.search import Search
+from metrpo.tune.space import Choices
 from metrpo.world.registry import tasks
 
 TASKS = ["Swimmer", "Snake", "Hopper", "HopperUpright", "HalfCheetah", "Ant", "Humanoid", "HumanoidStandup"]
@@ -256,6 +258,55 @@ def test_a_horizon_of_ones_own_decides_how_far_the_critics_look():
     assert config.advantage.discount == 0.995
 
 
+def test_only_options_decide_the_system_not_their_values():
+    def words(*more):
+        return parse(["train", "HalfCheetah-v5", *more]).system
+
+    assert words("--run-dir", "max_action") == words("--run-dir", "system") == "actor-critic"
+    assert words("--max-action", "0.5") == words("--max_action=0.5") == "me-trpo"
+
+
+def test_who_asks_for_the_critics_as_improver_has_their_system():
+    assert parse(["train", "Swimmer", "--improver", "actor-critic"]).system == "actor-critic"
+    assert preset("Swimmer", improver="actor-critic").system == "actor-critic"
+    assert preset("Swimmer", improver="actor-critic").advantage.discount == 0.99
+
+
+@pytest.mark.parametrize(
+    ("system", "settings", "message"),
+    [
+        (
+            "actor-critic",
+            {"improver": "trpo"},
+            "improver: expected actor-critic with the system actor-critic",
+        ),
+        ("actor-critic", {"max_action": 0.5}, "max_action: expected the system me-trpo or trpo to learn under limits"),
+        ("actor-critic", {"advantage.discount": 1.0}, "advantage.discount: expected less than 1 with the improver"),
+        ("svg-1", {"data": "log.npz"}, "data: expected the method model-based to learn from offline data, got svg"),
+    ],
+)
+def test_what_contradicts_itself_is_refused_before_anything_runs(system, settings, message):
+    config = configured("Snake", "fast", system, settings)
+    with pytest.raises(ConfigError, match=message):
+        training.init(config)
+    with pytest.raises(ConfigError, match=message):
+        Grid(("Snake",), (system,), settings={name: [value] for name, value in settings.items()}).runs()
+
+
+def test_the_presets_contradict_themselves_nowhere():
+    for task in TASKS:
+        for name in typing.get_args(Preset):
+            for system in SYSTEMS:
+                require_consistent(preset(task, name, system))
+
+
+def test_what_is_searched_decides_the_system_too():
+    assert Search("Snake", {"max_action": Choices((0.5, 1.0))}).system == "me-trpo"
+    assert Search("Snake", {"fit.max_steps": Choices((100, 200))}).system == "actor-critic"
+    with pytest.raises(ConfigError, match=r"advantage\.discount: expected less than 1"):
+        Search("Snake", {"advantage.discount": Choices((0.99, 1.0))})
+
+
 def test_settings_on_top():
     config = preset("Swimmer", "paper", seed=3, iterations=2)
     assert (config.seed, config.iterations) == (3, 2)
@@ -274,6 +325,8 @@ def test_settings_that_need_each_other_may_come_in_any_order():
 def test_an_unknown_preset_is_refused():
     with pytest.raises(ConfigError, match="preset: expected one of fast, paper, long-horizon, got 'quick'"):
         preset("Swimmer", "quick")
+    with pytest.raises(ConfigError, match=r"preset: expected its name as the second argument, .* got preset='paper'"):
+        preset("Swimmer", preset="paper")
     with pytest.raises(ConfigError, match="unknown setting 'colour'"):
         preset("Swimmer", colour=1)
 

@@ -126,6 +126,8 @@ def usual_system(task: str, name: str, settings: Mapping[str, Any]) -> System:
 
     Where `settings` say how to learn, or limit the actions (`ONLY_ME_TRPO`), it is `me-trpo`.
     """
+    if settings.get("improver") == "actor-critic":
+        return "actor-critic"
     if name != "fast" or settings.keys() & ONLY_ME_TRPO:
         return "me-trpo"
     row = SAME_AS.get(task, task)
@@ -140,6 +142,9 @@ def preset(task: str, name: str = "fast", system: str | None = None, **top_level
     A system of None is the task's usual one (`usual_system`). Raises `ConfigError` for an unknown preset, system or
     setting.
     """
+    if "preset" in top_level:
+        got = top_level["preset"]
+        raise ConfigError(f"preset: expected its name as the second argument, or as name=, got preset={got!r}")
     if name not in typing.get_args(Preset):
         raise ConfigError(f"preset: expected one of {', '.join(typing.get_args(Preset))}, got {name!r}")
     row = SAME_AS.get(task, task)

@@ -17,11 +17,10 @@ from typing import Any
 from metrpo import budget
 from metrpo.algorithm import Log, Row
 from metrpo.callbacks import Callback, Callbacks
-from metrpo.config import Config
+from metrpo.config import Config, require_consistent
 from metrpo.console.progress import SILENT, Progress, library_progress
-from metrpo.errors import ConfigError, MetrpoError
+from metrpo.errors import MetrpoError
 from metrpo.finite import require_finite
-from metrpo.limits import NONE, Limits
 from metrpo.run import task_file
 from metrpo.run.directory import RunDirectory
 from metrpo.run.memory import require_memory
@@ -47,8 +46,6 @@ METHODS = {
     "ddpg": "metrpo.baselines.stable_baselines",
 }
 """Modules with `init` and `step`; imported when used, because some need extra libraries."""
-_LIMITED = ("model-based", "trpo")
-"""Methods whose real steps `world.collection` plays, and that learn from actions as executed."""
 
 
 def init(config: Config) -> Saved:
@@ -61,12 +58,7 @@ def init(config: Config) -> Saved:
 
 
 def _init(config: Config, task: Task) -> Saved:
-    if config.method != "model-based" and (config.data is not None or config.real_steps == 0):
-        raise ConfigError(f"data: expected the method model-based to learn from offline data, got {config.method}")
-    learner = config.improver if config.improver == "actor-critic" else config.method
-    if learner not in _LIMITED and Limits.of(config) != NONE:
-        limit = "max_action" if config.max_action < 1 else "max_change"
-        raise ConfigError(f"{limit}: expected the system me-trpo or trpo to learn under limits, got {learner}")
+    require_consistent(config)
     require_memory(config, task)
     state: Saved = import_module(METHODS[config.method]).init(config, task)
     return state

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 
 import pytest
 
@@ -79,6 +80,15 @@ CASES = [
     ("end-untrusted", changed(10, end_false_alarms=0.03), CONFIG, 10, "3.0% of other steps mistaken for an end"),
     ("end-untrusted", changed(10, end_error=0.2), CONFIG, 10, "calibration error 20.0%"),
 ]
+
+
+@pytest.mark.parametrize("rows", [c[1] for c in CASES], ids=[c[0] for c in CASES])
+def test_to_the_critics_nothing_is_recommended_that_they_do_not_read(rows):
+    config = dataclasses.replace(CONFIG, improver="actor-critic", ensemble=EnsembleConfig(members=1))
+    unread = r"\b(trpo|imagine|policy|validate)\.[a-z_]+|collect\.max_std|beyond the limits"
+    for concern in examine(rows, config):
+        if concern.code not in ("nothing-accepted", "validation-never-stops"):  # their updates are all accepted
+            assert not re.search(unread, concern.text), concern.text
 
 
 @pytest.mark.parametrize(("code", "rows", "config", "since", "said"), CASES, ids=[c[0] for c in CASES])

@@ -22,6 +22,7 @@ from metrpo.commands.default_dir import default_run_dir
 from metrpo.commands.main import main
 from metrpo.commands.parse import parse
 from metrpo.config import Config
+from metrpo.console.interrupt import Stopped
 from metrpo.launch.run_spec import RunSpec
 from metrpo.presets import preset
 from metrpo.run import derived_files, installation, machine, video
@@ -116,6 +117,29 @@ def test_a_video_is_made_again_only_for_another_policy(capsys, monkeypatch):
 
 
 TEN = ["--ensemble.members", "10"]
+
+
+@pytest.mark.parametrize("words", [("--real-steps", "0"), ("--real_steps=0",)])
+def test_learning_from_a_log_alone_has_a_budget_of_iterations(words):
+    options = parse(["train", "Pendulum-v1", "--data", "log.npz", *words, "--iterations", "2"])
+    assert (options.real_steps, options.iterations) == (0, 2)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), Stopped(signal.SIGINT)])
+def test_a_process_that_was_stopped_ends_without_a_traceback_of_one_more_ctrl_c(error, monkeypatch, capsys):
+    def stopped(_):
+        raise error
+
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(sys.modules["metrpo.commands.main"], "parse", stopped)
+    try:
+        assert main(["doctor"]) == 130
+        assert signal.getsignal(signal.SIGINT) is before, "a program that calls it goes on"
+        monkeypatch.setattr(sys, "argv", ["metrpo", "doctor"])
+        assert main() == 130
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_the_default_directory_follows_from_the_settings(capsys):

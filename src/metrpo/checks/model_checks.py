@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from metrpo.checks.finding import Concern, after, horizons, iteration_at, losses_of, short, since_when
+from metrpo.checks.finding import Concern, after, by_critics, horizons, iteration_at, losses_of, short, since_when
 from metrpo.config import Config
 from metrpo.counting import counted
 from metrpo.run.metrics import Row, column
@@ -48,6 +48,7 @@ def model_exploited(rows: Sequence[Row], config: Config) -> Concern | None:
         else f"{short(imagined)}, real return {short(earned)}"
     )
     members = "five models instead of one" if config.ensemble.members == 1 else "more models"
+    shorter = "less trust (actor_critic.trust)" if by_critics(config) else "shorter imagined episodes (imagine.horizon)"
     early = len(rows) <= EARLY
     return Concern(
         "model-exploited",
@@ -55,7 +56,7 @@ def model_exploited(rows: Sequence[Row], config: Config) -> Concern | None:
         since,
         f"Imagined return {times} (mean of {AVERAGED} iterations)",
         "the policy exploits the models' errors" + (", as most do on little data" if early else "") + _where(rows),
-        f"try {members} (ensemble.members), shorter imagined episodes (imagine.horizon) or more real steps",
+        f"try {members} (ensemble.members), {shorter} or more real steps",
     )
 
 
@@ -168,13 +169,18 @@ def diverged(rows: Sequence[Row], config: Config) -> Concern | None:
     since = since_when(rows, share > DIVERGED)
     if since is None:
         return None
+    shorter, noise = (
+        ("actor_critic.horizon", "actor_critic.entropy_target")
+        if by_critics(config)
+        else ("imagine.horizon", "collect.max_std")
+    )
     return Concern(
         "rollouts-diverge",
         "warning",
         since,
         f"{share[-1]:.1%} of the imagined rollouts diverge",
         "the models blow up on their own predictions, and the policy learns from the rest",
-        "shorten imagined episodes (imagine.horizon), add models (ensemble.members), lower collect.max_std",
+        f"shorten imagined episodes ({shorter}), add models (ensemble.members), lower {noise}",
     )
 
 

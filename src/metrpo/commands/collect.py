@@ -28,7 +28,8 @@ class Collect:
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
     """The run directory."""
     steps: Annotated[int | None, arg(metavar="INT")] = None
-    """Play until at least this many new steps wait to be learned from; default: the run's collect.steps."""
+    """Play until at least this many new steps wait to be learned from; default: as many as
+    its next iteration collects."""
     data: Annotated[str | None, arg(metavar="FILE")] = None
     """Instead of playing: minari:NAME, or an .npz of states, actions, rewards, next_states, terminated."""
     task: Annotated[str | None, arg(metavar="TASK")] = None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -38,9 +39,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         say_how_to_resume(error, arguments)
         return 2
     except KeyboardInterrupt as stopped:
+        _end_in_peace(argv)
         say_how_to_resume(stopped, arguments)
         return 130
     except Stopped as stopped:
+        _end_in_peace(argv)
         say_how_to_resume(stopped, arguments)
         return 128 + stopped.number
     except BrokenPipeError:  # `metrpo train --help | head`
@@ -49,6 +52,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return end.code if isinstance(end.code, int) else 2
     finally:
         mute_broken_output()  # the interpreter flushes once more
+
+
+def _end_in_peace(argv: Sequence[str] | None) -> None:
+    """Where the process ends anyway, one more Ctrl-C would only show a traceback of the interpreter's own end."""
+    if argv is None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _occupy_standard_files() -> None:

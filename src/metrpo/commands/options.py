@@ -28,7 +28,7 @@ class RunOptions(Config):
     """Modules to import first, because they register the environment."""
     preset: Preset = "fast"
     """The defaults of all other settings. fast: learns soonest on two CPU cores; paper: the paper's values;
-    long-horizon: for tasks of 1,000 steps."""
+    long-horizon: me-trpo for tasks of 1,000 steps, which fast leaves to the actor-critic."""
     system: Annotated[System, arg(metavar="NAME")] = "me-trpo"
     """The method: me-trpo; actor-critic, the usual one for episodes of more than 300 steps, Snake, Ant and the
     humanoids; or one to compare these with. trpo, ppo, ddpg, svg-1 and svg-inf learn without the ensemble; trpo, ppo

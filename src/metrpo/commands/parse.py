@@ -67,7 +67,10 @@ def _system(options: RunOptions, arguments: list[str]) -> str | None:
     """The system that is asked for, by its name or by what only one can do; None: the task's usual one."""
     from metrpo.presets import ONLY_ME_TRPO
 
-    asked = {word.partition("=")[0].removeprefix("--").replace("-", "_") for word in arguments}
+    options_named = {word.partition("=")[0] for word in arguments if word.startswith("--")}
+    asked = {option.removeprefix("--").replace("-", "_") for option in options_named}
+    if "system" not in asked and options.improver == "actor-critic":
+        return "actor-critic"
     return options.system if asked & {"system", *ONLY_ME_TRPO} else None
 
 

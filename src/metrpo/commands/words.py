@@ -95,8 +95,11 @@ def understood(parse: Callable[[], T], kind: type, arguments: Sequence[str]) -> 
 
 
 def _require_one_budget(arguments: Sequence[str]) -> None:
-    options = [word.partition("=")[0].replace("_", "-") for word in arguments]
-    if all(option in options for option in _BUDGET):
+    words = [part for word in arguments for part in (word.split("=", 1) if word.startswith("--") else (word,))]
+    options = [word.replace("_", "-") for word in words]
+    # No real steps at all: learning from a log alone, for so many iterations.
+    from_log = "--real-steps" in options[:-1] and options[options.index("--real-steps") + 1] == "0"
+    if all(option in options for option in _BUDGET) and not from_log:
         raise ConfigError(f"{arguments[0]}: expected {' or '.join(_BUDGET)}, got both; leave one out")
 
 

@@ -1,5 +1,6 @@
 """Every setting of a run, and its JSON."""
 
+from metrpo.config.contradictions import require_consistent
 from metrpo.config.improver_settings import ActorCriticConfig, GradientConfig, PPOConfig, SVGConfig, TRPOConfig
 from metrpo.config.schema import BUDGET_FIELDS, Config, ImproverName, Method, Preset, System
 from metrpo.config.serialise import ADDED, convert, difference, flatten, from_json, to_json
@@ -37,5 +38,6 @@ __all__ = [
     "difference",
     "flatten",
     "from_json",
+    "require_consistent",
     "to_json",
 ]

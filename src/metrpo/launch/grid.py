@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, get_args
 
-from metrpo.config import BUDGET_FIELDS, Preset, System
+from metrpo.config import BUDGET_FIELDS, Preset, System, require_consistent
 from metrpo.counting import named_value
 from metrpo.errors import ConfigError
 from metrpo.launch.run_spec import RunSpec
@@ -69,7 +69,7 @@ class Grid:
         if unknown := [s for s in self.budgets if s not in systems]:
             raise ConfigError(f"budget: expected a system of the grid ({', '.join(systems)}), got {unknown[0]}")
         for run in runs:
-            _ = run.config
+            require_consistent(run.config)
         return list(dict.fromkeys(runs))
 
     def _budgets(self) -> tuple[dict[str, tuple[tuple[str, Any], ...]], tuple[tuple[str, Any], ...]]:

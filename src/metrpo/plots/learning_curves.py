@@ -180,7 +180,7 @@ def _require_column(runs: Sequence[SeenRun], option: str, name: str) -> None:
     if not any(np.isfinite(run.column(name)).any() for run in runs):
         have = [n for n in columns if any(np.isfinite(run.column(n)).any() for run in runs)]
         more = ", or one of diagnostics.csv" if any(run.details for run in runs) else ""
-        said = "an empty one (deterministic runs keep no clock)" if name in columns else repr(name)
+        said = "one without a number in any run" if name in columns else repr(name)
         raise ConfigError(
             f"{option}: expected a column with numbers ({', '.join(have) or 'there is none'}{more}), got {said}"
         )

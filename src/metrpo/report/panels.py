@@ -25,11 +25,16 @@ _QUANTITIES = (
     ("gap", "Gap", "imagined minus real return; near zero is good", True),
     ("fraction_improved", "Models improved", "share of the models in which the policy improved", True),
     ("updates", "Policy updates", "tried in each iteration", True),
-    ("accepted_updates", "Accepted updates", "of those tried, kept by validation", True),
+    ("accepted_updates", "Accepted updates", "of those tried", True),
     ("rejected_steps", "Rejected updates", "of those tried, did not move the policy", True),
     ("kl", "KL divergence", "mean over the updates", True),
     ("mean_std", "Standard deviation", "of the policy's actions", True),
-    ("saturated", "Saturated actions", "share of the policy's mean actions beyond the limits", True),
+    ("saturated", "Saturated actions", "share of the policy's mean actions beyond the limits (critics: 0.99)", True),
+    ("critic_loss", "Critics' loss", "in squared units of their scale", True),
+    ("value", "Value", "what the critics say on average", False),
+    ("entropy", "Entropy", "of the actor, in nats", False),
+    ("entropy_weight", "Entropy's weight", "what a nat is worth, in rewards", True),
+    ("actor_gradient_norm", "Actor's gradient", "its norm", True),
     ("diverged", "Diverged rollouts", "share of imagined rollouts", True),
     ("error_1", "Model error, one step", "on held-out real steps; 1: no better than predicting no change", False),
     ("error_T", "Model error, an episode", "the same after a whole imagined episode", False),
@@ -190,7 +195,8 @@ def _of_run(s: Seen, x: str, x_label: str) -> str:
         lines = [Line(at, y, name, style, dots=False) for name, y, style in curves if np.isfinite(y).any()]
         drawn = chart("Policy updates", lines, x_label, "", axes=Axes(zero=True))
         legend = [(line.style, line.name) for line in lines]
-        parts.append(figure("Policy updates", "tried, accepted by validation, rejected without a move", drawn, legend))
+        kept_by = "kept" if run.config.improver == "actor-critic" else "accepted by validation"
+        parts.append(figure("Policy updates", f"tried, {kept_by}, rejected without a move", drawn, legend))
     stages = [name for name in run.rows[0] if name.startswith("seconds_") and np.nansum(run.column(name)) > 0]
     if stages:
         names = [name.removeprefix("seconds_") for name in stages]

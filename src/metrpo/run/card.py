@@ -67,6 +67,14 @@ def task_name(text: str) -> str:
     return f"{file.replace(chr(92), '/').rpartition('/')[2]}:{name}" if colon and ".py" in file else plain
 
 
+def _method(run: SeenRun) -> str:
+    if run.config.method != "model-based":
+        return f"{run.config.method}, without models"
+    if run.config.improver == "actor-critic":
+        return "an off-policy actor-critic in an ensemble of learned models"
+    return "Model-Ensemble Trust-Region Policy Optimization, arXiv 1802.10592"
+
+
 def _body(run: SeenRun, card: dict[str, Any], task: str, earned: str, repo: str, files: Sequence[str]) -> list[str]:
     """The card's text, line by line."""
     code = f"`{task.replace('`', chr(39))}`"
@@ -76,7 +84,7 @@ def _body(run: SeenRun, card: dict[str, Any], task: str, earned: str, repo: str,
     return [
         f"# {card['system']} for {code}",
         "",
-        f"A policy for {code}, trained by metrpo (Model-Ensemble Trust-Region Policy Optimization, arXiv 1802.10592).",
+        f"A policy for {code}, trained by metrpo ({_method(run)}).",
         "",
         f"- return: {earned or 'not measured'}{over}",
         *(no_skill or ["- doing nothing, random actions: not measured"]),

@@ -17,7 +17,6 @@ import numpy as np
 from metrpo.actor_critic_phase import branches, run_block
 from metrpo.config import Config
 from metrpo.console.progress import Progress
-from metrpo.errors import ConfigError
 from metrpo.model.bounds import bounds_of
 from metrpo.model.ensemble import Ensemble, with_carried
 from metrpo.model.imagine import ImagineInfo, Simulator, disagreement, outcome
@@ -50,15 +49,7 @@ _NEAR = 0.99
 
 
 def fresh(config: Config, task: Task, key: Array) -> tuple[Policy, Learner]:
-    """A policy and a learner that have learned nothing.
-
-    Raises `ConfigError` without a discount, on which the values' scale rests.
-    """
-    if config.advantage.discount >= 1:
-        got = config.advantage.discount
-        raise ConfigError(
-            f"advantage.discount: expected less than 1 with improver actor-critic (0.995, say), got {got}"
-        )
+    """A policy and a learner that have learned nothing. (The values' scale rests on a discount below 1.)"""
     sizes = task.state_size, task.action_size, config.policy.hidden
     learner = actor_critic.init(UpdateSettings.of(config), key, *sizes)
     policy = squashed.mean_policy(learner.actor, None, np.zeros((0, task.state_size), np.float32))

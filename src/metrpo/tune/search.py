@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from metrpo import budget
-from metrpo.config import Config, Preset, System, flatten
+from metrpo.config import Config, Preset, System, flatten, require_consistent
 from metrpo.errors import ConfigError
 from metrpo.launch.grid import flat, seeds_of
 from metrpo.launch.run_spec import RunSpec
@@ -82,12 +82,14 @@ class Search:
                 "searched one; add --pruner none, and --real-steps, so that all trials cost the same"
             )
         object.__setattr__(self, "task", self._task().name)
-        object.__setattr__(self, "system", self.system or usual_system(self.task, self.preset, self.settings))
+        # What is searched may be what only one system can do.
+        system = self.system or usual_system(self.task, self.preset, {**self.space, **self.settings})
+        object.__setattr__(self, "system", system)
         for name, over in self.space.items():
             for value in over.outermost:
-                override(self.base, {name: value})
+                require_consistent(override(self.base, {name: value}))
         for end in (0, -1):
-            override(self.base, {name: over.outermost[end] for name, over in self.space.items()})
+            require_consistent(override(self.base, {name: over.outermost[end] for name, over in self.space.items()}))
 
     def _task(self) -> Task:
         return get_task(self.task, self.settings.get("env_kwargs", ()), self.settings.get("imports", ()))
