@@ -7,12 +7,12 @@ import json
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from metrpo.commands import main
 from metrpo.comparison import compare
 from metrpo.config import Config, EnsembleConfig
 from metrpo.errors import ConfigError
+from metrpo.plots import learning_curves
 from metrpo.plots.bands import curve
 from metrpo.plots.learning_curves import Look, plot
 from metrpo.report.tables import markdown_row, written
@@ -146,7 +146,7 @@ def test_steps_that_go_down_cost_no_table(tmp_path):
 
 def test_a_picture_looks_as_asked(folder, tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: seen.append(self) or file.write(b"x"))
+    monkeypatch.setattr(learning_curves, "png_of", lambda figure: seen.append(figure) or b"x")
     words = ["--title", "A $title", "--x-label", "steps", "--y-label", "earned", "--y-limits", "1", "40"]
     words += ["--x-limits", "90", "310", "--y-scale", "log", "--x-scale", "log", "--legend", "inside"]
     assert main.main(["plot", str(folder / "me-trpo"), "--out", str(tmp_path / "a.png"), *words]) == 0
@@ -161,7 +161,7 @@ def test_a_picture_looks_as_asked(folder, tmp_path, monkeypatch):
 
 def test_legends_side_by_side_do_not_meet(tmp_path, monkeypatch):
     seen = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: seen.append(self) or file.write(b"x"))
+    monkeypatch.setattr(learning_curves, "png_of", lambda figure: seen.append(figure) or b"x")
     for task in ("Swimmer", "Hopper", "Ant"):
         for members in (1, 2, 3):
             config = Config(task, ensemble=EnsembleConfig(members=members, probabilistic=members > 1))

@@ -242,10 +242,10 @@ def test_plot_writes_the_kind_that_is_asked_for_twice_the_same(tmp_path, capsys,
 
 
 def test_plot_draws_what_is_asked_for(tmp_path, monkeypatch):
-    from matplotlib.figure import Figure
+    from metrpo.plots import learning_curves
 
     drawn = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: drawn.append(self))
+    monkeypatch.setattr(learning_curves, "png_of", lambda figure: drawn.append(figure) or b"x")
     some_runs(tmp_path / "runs")
     for x, y in (("real_steps", "return_real"), ("wall_seconds", "kl"), ("iteration", "gap")):
         assert main(["plot", "runs", "--x", x, "--y", y]) == 0
@@ -266,10 +266,10 @@ def test_plot_draws_what_is_asked_for(tmp_path, monkeypatch):
 
 
 def test_plot_draws_diagnostics_against_their_iterations_steps(tmp_path, monkeypatch):
-    from matplotlib.figure import Figure
+    from metrpo.plots import learning_curves
 
     drawn = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: drawn.append(self))
+    monkeypatch.setattr(learning_curves, "png_of", lambda figure: drawn.append(figure) or b"x")
     rows = [r | {"error_10_3": 10.0 ** r["iteration"], "improved_0": 0.0} for r in details()]
     a_run(tmp_path / "a", diagnostics=rows[2:5])  # the file may be a row behind, or begin late
     for y in ("error_10_3", "improved_0", "error_T"):

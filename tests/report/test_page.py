@@ -340,11 +340,11 @@ def test_a_chart_puts_points_where_they_belong():
 
 
 def test_a_curve_without_an_environment_has_no_real_return(tmp_path, monkeypatch):
-    from matplotlib.figure import Figure
+    from metrpo.run import curve
 
     draw_curve(healthy(2), tmp_path / "curve.png", r"a $\task$, which is no formula")
     drawn = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, file, **_: drawn.append(self))
+    monkeypatch.setattr(curve, "png_of", lambda figure: drawn.append(figure) or b"x")
     arm = read_metrics(RESULTS / "own/examples-robot-arm.py-task/learned-reward/seed-0/metrics.csv")
     cheetah = read_metrics(RESULTS / "laptop/HalfCheetah/me-trpo/seed-0/metrics.csv")
     for rows in (arm, cheetah):
