@@ -140,10 +140,12 @@ def probabilistic(ensemble):
 
 for members, count, hidden, sampling, curiosity in (
     (3, 2, (16,), "step_rand", "history"),
-    (3, 4, (16,), "step_rand", "silu"),  # all three cut in four
+    (3, 4, (16,), "step_rand", 0.0),  # all three cut in four
     (4, 2, (16,), "eps_rand", 0.0),  # two each
     (5, 4, (16, 8, 8, 16), "step_rand", 0.1),
-    (3, 2, (16, 16), "step_rand", "noise"),  # one each, and one cut in two
+    (3, 2, (16, 16), "step_rand", 0.0),  # one each, and one cut in two
+    (3, 2, (16,), "step_rand", "noise"),
+    (3, 4, (16,), "step_rand", "silu"),
 ):
     ensemble = random_ensemble(members=members, scale=0.3, hidden=hidden)
     if curiosity == "history":

@@ -275,11 +275,7 @@ def test_who_asks_for_the_critics_as_improver_has_their_system():
 @pytest.mark.parametrize(
     ("system", "settings", "message"),
     [
-        (
-            "actor-critic",
-            {"improver": "trpo"},
-            "improver: expected actor-critic with the system actor-critic",
-        ),
+        ("actor-critic", {"improver": "trpo"}, "improver: expected actor-critic with the system actor-critic"),
         ("actor-critic", {"max_action": 0.5}, "max_action: expected the system me-trpo or trpo to learn under limits"),
         ("actor-critic", {"advantage.discount": 1.0}, "advantage.discount: expected less than 1 with the improver"),
         ("svg-1", {"data": "log.npz"}, "data: expected the method model-based to learn from offline data, got svg"),

@@ -17,7 +17,7 @@ def steps_left(config: Config, real_steps: int) -> float:
 
 def steps_wanted(config: Config, real_steps: int) -> int:
     """Real steps that the next iteration collects: as many as the settings say, or what is left of the budget."""
-    first = config.actor_critic.random_steps if config.improver == "actor-critic" and not real_steps else 0
+    first = config.actor_critic.random_steps if config.by_critics and not real_steps else 0
     return int(min(max(config.collect.steps, first), steps_left(config, real_steps)))
 
 

@@ -124,7 +124,8 @@ def usual_system(task: str, name: str, settings: Mapping[str, Any]) -> System:
     """The system that a task has where none is asked for: `me-trpo`; under `fast` `actor-critic` for long episodes and
     for the tasks of `BY_CRITICS`.
 
-    Where `settings` say how to learn, or limit the actions (`ONLY_ME_TRPO`), it is `me-trpo`.
+    Where `settings` say how to learn, or limit the actions (`ONLY_ME_TRPO`), it is `me-trpo`; but `actor-critic` where
+    that is the improver.
     """
     if settings.get("improver") == "actor-critic":
         return "actor-critic"
@@ -133,7 +134,7 @@ def usual_system(task: str, name: str, settings: Mapping[str, Any]) -> System:
     row = SAME_AS.get(task, task)
     if row in PAPER:
         return "actor-critic" if row in BY_CRITICS else "me-trpo"
-    return "actor-critic" if _is_long(task, _chosen(settings)) else "me-trpo"
+    return "actor-critic" if _horizon(task, _chosen(settings)) > LONG else "me-trpo"
 
 
 def preset(task: str, name: str = "fast", system: str | None = None, **top_level: Any) -> Config:
@@ -148,7 +149,8 @@ def preset(task: str, name: str = "fast", system: str | None = None, **top_level
     if name not in typing.get_args(Preset):
         raise ConfigError(f"preset: expected one of {', '.join(typing.get_args(Preset))}, got {name!r}")
     row = SAME_AS.get(task, task)
-    own = {} if row in PAPER else _generic(task, _chosen(top_level))
+    horizon = None if row in PAPER else _horizon(task, _chosen(top_level))
+    own = {} if horizon is None else _generic(horizon)
     overrides = (PAPER.get(row, {}) if name == "paper" else FAST_ALL | FAST.get(row, {})) | own
     if name == "long-horizon":
         overrides |= LONG_HORIZON_ALL
@@ -158,7 +160,7 @@ def preset(task: str, name: str = "fast", system: str | None = None, **top_level
         raise ConfigError(f"system: expected one of {', '.join(SYSTEMS)}, got {system!r}")
     overrides = overrides | SYSTEMS[system] | (SYSTEMS_PAPER.get(system, {}) if name == "paper" else {})
     if system == "actor-critic":
-        short = row in PAPER or not _is_long(task, _chosen(top_level))
+        short = horizon is None or horizon <= LONG  # the paper's tasks have 100 or 200 steps
         overrides |= (SHORT_BY_CRITICS if short else {}) | BY_CRITICS.get(row, {})
     config = Config(task=task, preset=cast(Preset, name))
     return override(config, overrides | {"system": system} | top_level)
@@ -180,19 +182,14 @@ def configured(task: str, name: str, system: str | None, settings: Overrides) ->
     return override(bare(task, name, system, settings), settings)
 
 
-def _is_long(task: str, chosen: Overrides) -> bool:
-    return _horizon(task, chosen) > LONG
-
-
 def _horizon(task: str, chosen: Overrides) -> int:
     from metrpo.world.registry import get_task  # needed only for a task that is not in these tables
 
     return get_task(task, **chosen).horizon
 
 
-def _generic(task: str, chosen: Overrides) -> Overrides:
+def _generic(horizon: int) -> Overrides:
     """For a task of the user's own: about five episodes an iteration, validated on about 10,000 steps of each model."""
-    horizon = _horizon(task, chosen)
     return {
         "iterations": 10,
         "collect.steps": min(max(5 * horizon, 1000), 5000),

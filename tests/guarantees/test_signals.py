@@ -213,13 +213,11 @@ def test_several_runs_are_asked_twice():
 def test_a_process_ends_so(number, code, tmp_path):
     """Asked while it fits for the first time, which takes a while: it is compiled then.
 
-    One of the two has the command's own flags and an empty cache, as users have them.
+    The cache is empty, and one of the two has the command's own flags, as users have them.
     """
     line = tiny_run.process_line(tmp_path / "run", "--device", "cpu")
-    own = dict(os.environ)
-    if number == signal.SIGINT:
-        del own["XLA_FLAGS"]
-        own["JAX_COMPILATION_CACHE_DIR"] = str(tmp_path / "cache")
+    own = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS" or number != signal.SIGINT}
+    own |= {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
     with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=own) as process:
         while not process.stdout.readline().endswith("fit\n"):
             assert process.poll() is None

@@ -73,11 +73,6 @@ def standard_error(rows: Sequence[Row], config: Config) -> np.ndarray:
     return np.nan_to_num(column(rows, "return_real_std")) / math.sqrt(config.evaluation_episodes)
 
 
-def by_critics(config: Config) -> bool:
-    """Whether the actor-critic learns, which has settings of its own to turn."""
-    return config.improver == "actor-critic"
-
-
 def short(value: float) -> str:
     """A number with three digits, and an exponent only where one is needed."""
     return f"{value:.0f}" if 100 <= abs(value) < 1e6 else f"{value:.3g}"

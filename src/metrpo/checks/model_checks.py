@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from metrpo.checks.finding import Concern, after, by_critics, horizons, iteration_at, losses_of, short, since_when
+from metrpo.checks.finding import Concern, after, horizons, iteration_at, losses_of, short, since_when
 from metrpo.config import Config
 from metrpo.counting import counted
 from metrpo.run.metrics import Row, column
@@ -48,7 +48,7 @@ def model_exploited(rows: Sequence[Row], config: Config) -> Concern | None:
         else f"{short(imagined)}, real return {short(earned)}"
     )
     members = "five models instead of one" if config.ensemble.members == 1 else "more models"
-    shorter = "less trust (actor_critic.trust)" if by_critics(config) else "shorter imagined episodes (imagine.horizon)"
+    shorter = "less trust (actor_critic.trust)" if config.by_critics else "shorter imagined episodes (imagine.horizon)"
     early = len(rows) <= EARLY
     return Concern(
         "model-exploited",
@@ -171,7 +171,7 @@ def diverged(rows: Sequence[Row], config: Config) -> Concern | None:
         return None
     shorter, noise = (
         ("actor_critic.horizon", "actor_critic.entropy_target")
-        if by_critics(config)
+        if config.by_critics
         else ("imagine.horizon", "collect.max_std")
     )
     return Concern(

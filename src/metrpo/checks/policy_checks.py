@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from metrpo.checks.finding import Concern, by_critics, iteration_at, short, since_when, standard_error
+from metrpo.checks.finding import Concern, iteration_at, short, since_when, standard_error
 from metrpo.config import Config
 from metrpo.counting import counted
 from metrpo.run.metrics import Row, column
@@ -45,7 +45,7 @@ def return_fell(rows: Sequence[Row], config: Config) -> Concern | None:
     since = since_when(rows, np.append(False, (np.arange(len(pairs)) > best) & (pairs < low))) or int(
         iteration_at(rows, -1)
     )
-    size = "gradient.learning_rate" if by_critics(config) else "trpo.max_kl"
+    size = "gradient.learning_rate" if config.by_critics else "trpo.max_kl"
     return Concern(
         "return-fell",
         "warning",
@@ -95,7 +95,7 @@ def no_improvement(rows: Sequence[Row], config: Config, yardsticks: Mapping[str,
     real, error = column(rows, "return_real"), standard_error(rows, config)
     if len(real) < FLAT or not np.isfinite(real).all() or real[1:].max() > real[0] + 2 * error[0]:
         return None
-    noise = "actor_critic.entropy_target" if by_critics(config) else "collect.max_std"
+    noise = "actor_critic.entropy_target" if config.by_critics else "collect.max_std"
     skilled = bool(yardsticks) and real[0] > max(yardsticks.values()) + 2 * error[0]
     return Concern(
         "no-improvement",
@@ -155,7 +155,7 @@ def few_episodes(rows: Sequence[Row], config: Config) -> Concern | None:
 
 def std_collapsed(rows: Sequence[Row], config: Config) -> Concern | None:
     """The policy hardly explores any more."""
-    if config.method == "ddpg" or by_critics(config):
+    if config.method == "ddpg" or config.by_critics:
         return None  # the noise of one is not the policy's, that of the other steered by its entropy
     std = column(rows, "mean_std")
     since = since_when(rows, std < COLLAPSED * config.policy.initial_std)
@@ -183,7 +183,7 @@ def saturated(rows: Sequence[Row], config: Config) -> Concern | None:
             "the tanh is flat there: the policy may be stuck in a local optimum",
             "raise actor_critic.entropy_target, or lower gradient.learning_rate",
         )
-        if by_critics(config)
+        if config.by_critics
         else (
             f"{share[-1]:.0%} of the policy's mean actions beyond the limits",
             "clipped actions have no gradient: the policy may be stuck in a local optimum",
@@ -205,7 +205,7 @@ def updates_rejected(rows: Sequence[Row], config: Config) -> Concern | None:
     measured = f"{share[-1]:.0%} of the updates rejected" if share[-1] > REJECTED else f"Updates of KL {short(kl[-1])}"
     advice = (
         "lower gradient.learning_rate and actor_critic.critic_learning_rate, or give a reward that varies"
-        if by_critics(config)
+        if config.by_critics
         else "use more imagined steps an update (imagine.steps), more trpo.damping, or a reward that varies"
     )
     return Concern(

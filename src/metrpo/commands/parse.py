@@ -15,6 +15,7 @@ from metrpo.commands.options import FEW, RunOptions
 from metrpo.commands.words import command_of, joined, lists_of, understood
 from metrpo.config import Config
 from metrpo.errors import MetrpoError
+from metrpo.systems import Overrides
 
 _HELP = ("-h", "--help", "--help-all")
 
@@ -56,22 +57,23 @@ def _parse_run(kind: type[RunOptions], arguments: list[str], asked: str | None) 
 
     task = get_task(first.task, first.env_kwargs, first.imports).name
     of_task = {"env_kwargs": first.env_kwargs, "imports": first.imports}
-    defaults = _defaults(kind, preset(task, first.preset, _system(first, arguments), **of_task))
+    system = _system(first, task, of_task, arguments)
+    defaults = _defaults(kind, preset(task, first.preset, system, **of_task))
     if asked is not None:
         _show(kind, defaults, arguments[0], only)
     parsed = understood(lambda: _tyro(kind, defaults, arguments), kind, arguments)
     return dataclasses.replace(parsed, task=task)
 
 
-def _system(options: RunOptions, arguments: list[str]) -> str | None:
-    """The system that is asked for, by its name or by what only one can do; None: the task's usual one."""
-    from metrpo.presets import ONLY_ME_TRPO
+def _system(options: RunOptions, task: str, of_task: Overrides, arguments: list[str]) -> str:
+    """The system that is asked for by its name, or the usual one with what else is asked for."""
+    from metrpo.presets import ONLY_ME_TRPO, usual_system
 
-    options_named = {word.partition("=")[0] for word in arguments if word.startswith("--")}
-    asked = {option.removeprefix("--").replace("-", "_") for option in options_named}
-    if "system" not in asked and options.improver == "actor-critic":
-        return "actor-critic"
-    return options.system if asked & {"system", *ONLY_ME_TRPO} else None
+    named = (word.partition("=")[0] for word in arguments if word.startswith("--"))
+    asked = {option.removeprefix("--").replace("-", "_") for option in named}
+    if "system" in asked:
+        return options.system
+    return usual_system(task, options.preset, of_task | {name: getattr(options, name) for name in asked & ONLY_ME_TRPO})
 
 
 def _defaults(kind: type[RunOptions], config: Config) -> RunOptions:

@@ -125,6 +125,11 @@ class Config:
     actor_critic: ActorCriticConfig = field(default_factory=ActorCriticConfig)
     validate: ValidateConfig = field(default_factory=ValidateConfig)
 
+    @property
+    def by_critics(self) -> bool:
+        """Whether the actor-critic learns: it has settings of its own, and reads few of the others."""
+        return self.improver == "actor-critic"
+
     def __post_init__(self) -> None:
         require(bool(self.task), "task", self.task, "a task name")
         object.__setattr__(self, "env_kwargs", canonical(self.env_kwargs))

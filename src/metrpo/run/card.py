@@ -70,7 +70,7 @@ def task_name(text: str) -> str:
 def _method(run: SeenRun) -> str:
     if run.config.method != "model-based":
         return f"{run.config.method}, without models"
-    if run.config.improver == "actor-critic":
+    if run.config.by_critics:
         return "an off-policy actor-critic in an ensemble of learned models"
     return "Model-Ensemble Trust-Region Policy Optimization, arXiv 1802.10592"
 

@@ -57,7 +57,7 @@ def _needs(config: Config, task: Task) -> list[Need]:
             Need("fit.batch_size", config.fit.batch_size, "the minibatches of a step", batch),
             Need("validate.starts", config.validate.starts, "the start states of validation", starts),
         ]
-        if config.improver == "actor-critic":
+        if config.by_critics:
             needs += _actor_critic_needs(config, task)
         elif config.advantage.baseline == "network":
             needs.append(Need("advantage.value_hidden", config.advantage.value_hidden, "the value network", value))
