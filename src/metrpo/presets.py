@@ -12,7 +12,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, cast
 
-from metrpo.config import Config, Preset, System, convert
+from metrpo.config import Config, Preset, System, convert, difference, flatten
 from metrpo.errors import ConfigError
 from metrpo.systems import PAPER as SYSTEMS_PAPER
 from metrpo.systems import SYSTEMS, Overrides
@@ -180,6 +180,13 @@ def bare(task: str, name: str, system: str | None, settings: Overrides) -> Confi
 def configured(task: str, name: str, system: str | None, settings: Overrides) -> Config:
     """The config of a preset with dotted `settings` on top. Raises `ConfigError` as `preset` and `override`."""
     return override(bare(task, name, system, settings), settings)
+
+
+def changed(config: Config) -> dict[str, Any]:
+    """Dotted setting -> value where it is not the preset's, budget aside; what creates the environment counts."""
+    usual = bare(config.task, config.preset, config.system, flatten(config))
+    differing = difference(dataclasses.replace(usual, env_kwargs=(), imports=()), config)
+    return {name: value for name, (_, value) in differing.items()}
 
 
 def _horizon(task: str, chosen: Overrides) -> int:

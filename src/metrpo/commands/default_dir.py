@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import hashlib
 import json
 from pathlib import Path
 from typing import Any
 
-from metrpo.config import Config, difference, flatten, from_json
+from metrpo.config import Config, difference, from_json
 from metrpo.counting import named_value
 from metrpo.errors import ConfigError
-from metrpo.presets import bare
+from metrpo.presets import changed
 from metrpo.run.files import folder_name
 
 _MOST, _LONGEST = 3, 60
@@ -26,9 +25,7 @@ def default_run_dir(config: Config) -> Path:
     """
     system = "" if config.system == "me-trpo" else f"{config.system}-"
     plain = Path("runs") / f"{folder_name(config.task)}-{system}{config.preset}-seed{config.seed}"
-    usual = bare(config.task, config.preset, config.system, flatten(config))
-    changed = difference(dataclasses.replace(usual, env_kwargs=(), imports=()), config)
-    values = {name: value for name, (_, value) in changed.items() if name != "seed"}
+    values = {name: value for name, value in changed(config).items() if name != "seed"}
     if not values or _is_run_of(plain, config):  # metrpo 0.1 put every run there
         return plain
     return plain.with_name(f"{plain.name}-{_words(values)}")

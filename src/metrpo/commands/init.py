@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 
-from metrpo.commands.options import RunOptions
+from metrpo.commands.options import RunOptions, warn_of_unread
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,7 @@ def run(command: Init) -> int:
     from metrpo.world.registry import task_for
 
     config, run_dir = command.config, command.directory
+    warn_of_unread(config)
     begin(config, run_dir)
     collect = f"metrpo collect {shlex.quote(str(run_dir))}"
     how = collect if task_for(config).playable else f"metrpo.append_episode, or {collect} --data FILE"

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from metrpo.config import Config, ImproverName, Method, Preset, System
+from metrpo.config import Config, ImproverName, Method, Preset, System, unread
 from metrpo.errors import ConfigError
 
+_log = logging.getLogger("metrpo")
 Switch = Annotated[bool, FlagCreatePairsOff]
 """A bool with one option, which flips it: --json, or --no-video. Settings of a run have two, for presets differ."""
 
@@ -66,6 +68,14 @@ class RunOptions(Config):
         from metrpo.commands.default_dir import default_run_dir
 
         return self.run_dir or default_run_dir(self.config)
+
+
+def warn_of_unread(config: Config) -> None:
+    """Says which settings were changed from the preset's in vain."""
+    from metrpo.presets import changed
+
+    for name, owner in unread(config, changed(config)).items():
+        _log.warning("%s is a setting of %s; it has no effect on this run (%s)", name, owner, config.system)
 
 
 FEW = frozenset(

@@ -13,7 +13,7 @@ from typing import Annotated
 from tyro.conf import arg
 
 from metrpo.commands.attend import attended_run
-from metrpo.commands.options import RunOptions, Switch
+from metrpo.commands.options import RunOptions, Switch, warn_of_unread
 from metrpo.config import Config
 from metrpo.console.interrupt import Interruptible
 from metrpo.errors import MetrpoError
@@ -46,6 +46,7 @@ def run(command: Train) -> int:
     from metrpo.training import train
 
     config, run_dir = command.config, command.directory
+    warn_of_unread(config)
 
     def complete(progress: Interruptible) -> str | None:
         return f"{run_dir} is complete: nothing is lost. {_AGAIN}" if _is_complete(run_dir, config) else None

@@ -13,6 +13,7 @@ from metrpo.config.stage_settings import (
     PolicyConfig,
     ValidateConfig,
 )
+from metrpo.config.unread import unread
 
 __all__ = [
     "ADDED",
@@ -40,4 +41,5 @@ __all__ = [
     "from_json",
     "require_consistent",
     "to_json",
+    "unread",
 ]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast, get_args
 
-from metrpo.config import BUDGET_FIELDS, Preset, System, require_consistent
+from metrpo.config import BUDGET_FIELDS, Config, Preset, System, require_consistent, unread
 from metrpo.counting import named_value
 from metrpo.errors import ConfigError
 from metrpo.launch.run_spec import RunSpec
@@ -68,8 +68,12 @@ class Grid:
         systems = list(dict.fromkeys(run.system for run in runs))
         if unknown := [s for s in self.budgets if s not in systems]:
             raise ConfigError(f"budget: expected a system of the grid ({', '.join(systems)}), got {unknown[0]}")
-        for run in runs:
-            require_consistent(run.config)
+        configs = [run.config for run in runs]
+        for config in configs:
+            require_consistent(config)
+        for name, values in self.settings.items():
+            if len(values) > 1:
+                require_read(name, configs)
         return list(dict.fromkeys(runs))
 
     def _budgets(self) -> tuple[dict[str, tuple[tuple[str, Any], ...]], tuple[tuple[str, Any], ...]]:
@@ -114,6 +118,16 @@ def budget_of(text: str) -> tuple[str, int]:
         return system, int(steps)
     except ValueError:
         raise ConfigError(f"budget: expected SYSTEM=REAL_STEPS such as trpo=300000, got {text!r}") from None
+
+
+def require_read(name: str, configs: Sequence[Config]) -> None:
+    """Raises `ConfigError` where none of the runs reads the setting, so that its values would all give the same."""
+    owners = [unread(config, [name]).get(name) for config in configs]
+    if owners and all(owners):
+        raise ConfigError(
+            f"{name}: expected a setting that some run reads, got one of {owners[0]}, and every run is "
+            f"{' or '.join(sorted({config.system for config in configs}))}; all its values would give the same"
+        )
 
 
 def require_once(option: str, names: Sequence[str]) -> None:

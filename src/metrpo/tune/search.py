@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from metrpo import budget
 from metrpo.config import Config, Preset, System, flatten, require_consistent
 from metrpo.errors import ConfigError
-from metrpo.launch.grid import flat, seeds_of
+from metrpo.launch.grid import flat, require_read, seeds_of
 from metrpo.launch.run_spec import RunSpec
 from metrpo.presets import configured, override, usual_system
 from metrpo.run.metrics import Row, numbers
@@ -85,11 +85,13 @@ class Search:
         # What is searched may be what only one system can do.
         system = self.system or usual_system(self.task, self.preset, {**self.space, **self.settings})
         object.__setattr__(self, "system", system)
-        for name, over in self.space.items():
-            for value in over.outermost:
-                require_consistent(override(self.base, {name: value}))
-        for end in (0, -1):
-            require_consistent(override(self.base, {name: over.outermost[end] for name, over in self.space.items()}))
+        tried = [override(self.base, {name: v}) for name, over in self.space.items() for v in over.outermost]
+        ends = ({name: over.outermost[end] for name, over in self.space.items()} for end in (0, -1))
+        tried += [override(self.base, values) for values in ends]
+        for config in tried:
+            require_consistent(config)
+        for name in self.space:
+            require_read(name, tried)
 
     def _task(self) -> Task:
         return get_task(self.task, self.settings.get("env_kwargs", ()), self.settings.get("imports", ()))
