@@ -353,7 +353,7 @@ def test_a_curve_without_an_environment_has_no_real_return(tmp_path, monkeypatch
     assert words[0] == [
         "collected (with exploration noise)",
         "imagined (models)",
-        "models that a policy update improved",
+        "models in which the policy improved",
     ]
     assert "real (deterministic policy)" in words[1]
     assert "gap: imagined - real" in words[1]

@@ -38,7 +38,7 @@ _NAMES = {
     "return_imagined": "imagined return",
     "return_collected": "collected return",
     "gap": "gap: imagined minus real return",
-    "fraction_improved": "share of the models that improved",
+    "fraction_improved": "share of the models in which the policy improved",
     "error_1": "model error after 1 step\n(1: as predicting no change)",
     "error_T": "model error after an imagined episode\n(1: as predicting no change)",
     "disagreement_real": "disagreement on real states (std)",

@@ -80,7 +80,8 @@ def _draw_returns(axes: Axes, steps: np.ndarray, rows: Sequence[Row], yardsticks
     axes.set_ylabel("return of an episode")
     levels = np.array(list(yardsticks.values()))
     axes.set_ylim(_frame(np.concatenate([real - std, real + std, collected, levels]), imagined, played))
-    axes.legend(loc="best", frameon=False, fontsize=9)
+    # Opaque: a yardstick's line may run through the best place that there is.
+    axes.legend(loc="best", fontsize=9, framealpha=0.9, edgecolor="none")
 
 
 def _frame(real: np.ndarray, others: np.ndarray, flattens: bool = True) -> tuple[float, float] | None:
@@ -113,7 +114,7 @@ def _draw_gap(axes: Axes, steps: np.ndarray, rows: Sequence[Row]) -> None:
         "^:",
         color=_SHARE,
         markersize=4,
-        label="models that a policy update improved",
+        label="models in which the policy improved",
     )
     share.set_ylim(-5, 105)
     share.set_ylabel("models improved (%)", color=_SHARE)
