@@ -11,7 +11,7 @@ import pytest
 import probe
 from counted_run import run
 from helpers import linear_ensemble
-from metrpo import algorithm, external, training
+from metrpo import algorithm, budget, external, training
 from metrpo.config import Config
 from metrpo.console.progress import Progress
 from metrpo.errors import ConfigError
@@ -104,6 +104,17 @@ def test_whole_episodes_that_bring_more_steps_than_asked_for_bring_more_updates(
         assert (row["real_steps"] - 40 * (state.iteration - 1), row["updates"]) == (steps, updates)
     begun = told.heard.index(("improve", 20))
     assert told.heard[begun + 1 : begun + 3] == [10, 20], "the bar is full when all is done"
+
+
+def test_episodes_are_whole_but_those_of_random_actions():
+    """A policy that never saw the rest of an episode fails there: Hopper-v5 hopped for 250 steps of 1,000 and fell."""
+    config = override(SMALL, {"collect.steps": 5, "actor_critic.random_steps": 20, "iterations": 2})
+    first = training.init(config)
+    after, _ = training.step(config, first)
+    for state, lengths in ((first, [5, 5, 5, 5]), (after, [probe.HORIZON])):
+        assert [len(e.rewards) for e in algorithm.collect(config, probe.PROBE, state)] == lengths
+    longer = override(config, {"collect.steps": 3000})
+    assert [budget.longest_episode(c, 1) for c in (config, longer)] == [1000, 3000]
 
 
 def test_a_log_alone_is_learned_from_as_if_the_settings_steps_were_new():

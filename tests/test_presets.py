@@ -12,7 +12,7 @@ from metrpo.commands.parse import parse
 from metrpo.config import Config, Preset, System, flatten, from_json, require_consistent, to_json
 from metrpo.errors import ConfigError
 from metrpo.launch.grid import Grid
-from metrpo.presets import BY_CRITICS, LONG_HORIZON_ALL, SHORT_BY_CRITICS, configured, preset
+from metrpo.presets import BY_CRITICS, LONG_HORIZON_ALL, SHORT_BY_CRITICS, configured, override, preset
 from metrpo.systems import SYSTEMS
 from metrpo.tune.search import Search
 from metrpo.tune.space import Choices
@@ -256,6 +256,22 @@ def test_the_critics_look_as_far_as_episodes_last(task, discount, episodes):
 def test_a_horizon_of_ones_own_decides_how_far_the_critics_look():
     config = preset("Pendulum-v1", system="actor-critic", env_kwargs={"max_episode_steps": 500})
     assert config.advantage.discount == 0.995
+
+
+def test_long_episodes_have_a_budget_of_real_steps_until_iterations_are_asked_for():
+    def parsed(*more):
+        config = parse(["train", "HalfCheetah-v5", *more]).config
+        return config.iterations, config.real_steps
+
+    assert preset("HalfCheetah-v5").real_steps == parsed()[1] == 50_000
+    assert parsed("--iterations", "5") == parsed("--iterations=5") == (5, None)
+    config = preset("HalfCheetah-v5", iterations=5)
+    assert (config.iterations, config.real_steps) == (5, None)
+    assert override(preset("HalfCheetah-v5"), {"iterations": 5}) == config
+    assert override(preset("HalfCheetah-v5"), {"seed": 1}).real_steps == 50_000
+    assert [run.config.real_steps for run in Grid(("HalfCheetah-v5",), iterations=3).runs()] == [None]
+    assert preset("HalfCheetah-v5", system="me-trpo").real_steps is preset("Snake").real_steps is None
+    assert override(Config("Swimmer", data="log.npz", real_steps=0), {"iterations": 5}).real_steps == 0
 
 
 def test_only_options_decide_the_system_not_their_values():

@@ -9,6 +9,10 @@ import numpy as np
 
 from metrpo.config import Config
 
+LONGEST = 1_000
+"""Steps after which an episode is cut, unless an iteration collects more: a policy that never saw the rest of an
+episode fails there (docs/actor-critic.md)."""
+
 
 def steps_left(config: Config, real_steps: int) -> float:
     """Real steps that may still be played after `real_steps`; infinity where the budget is of iterations."""
@@ -17,8 +21,18 @@ def steps_left(config: Config, real_steps: int) -> float:
 
 def steps_wanted(config: Config, real_steps: int) -> int:
     """Real steps that the next iteration collects: as many as the settings say, or what is left of the budget."""
-    first = config.actor_critic.random_steps if config.by_critics and not real_steps else 0
+    first = config.actor_critic.random_steps if _at_random(config, real_steps) else 0
     return int(min(max(config.collect.steps, first), steps_left(config, real_steps)))
+
+
+def longest_episode(config: Config, real_steps: int) -> int:
+    """Steps after which an episode of the next iteration is cut: of random actions, `collect.steps`."""
+    return config.collect.steps if _at_random(config, real_steps) else max(config.collect.steps, LONGEST)
+
+
+def _at_random(config: Config, real_steps: int) -> bool:
+    """Whether the next iteration is the actor-critic's first, which acts at random."""
+    return config.by_critics and not real_steps
 
 
 def finished(config: Config, iteration: int, real_steps: int) -> bool:

@@ -108,6 +108,9 @@ LONG = 300
 SHORT_BY_CRITICS: Overrides = {"advantage.discount": 0.99, "evaluation_episodes": 20}
 """What the actor-critic has where episodes are not that long, on top of `SYSTEMS`."""
 
+LONG_BY_CRITICS: Overrides = {"real_steps": 50_000}
+"""What it has where they are: an iteration may take 250 steps or 1,000, so that a number of iterations says little."""
+
 BY_CRITICS: dict[str, Overrides] = {
     "Snake": {"iterations": 69, "actor_critic.entropy_target": -2.0},  # some 30,000 real steps
     "Ant": {"iterations": 43},  # some 15,000 real steps
@@ -161,9 +164,9 @@ def preset(task: str, name: str = "fast", system: str | None = None, **top_level
     overrides = overrides | SYSTEMS[system] | (SYSTEMS_PAPER.get(system, {}) if name == "paper" else {})
     if system == "actor-critic":
         short = horizon is None or horizon <= LONG  # the paper's tasks have 100 or 200 steps
-        overrides |= (SHORT_BY_CRITICS if short else {}) | BY_CRITICS.get(row, {})
+        overrides |= (SHORT_BY_CRITICS if short else LONG_BY_CRITICS) | BY_CRITICS.get(row, {})
     config = Config(task=task, preset=cast(Preset, name))
-    return override(config, overrides | {"system": system} | top_level)
+    return override(override(config, overrides | {"system": system}), top_level)
 
 
 def _chosen(settings: Mapping[str, Any]) -> Overrides:
@@ -207,8 +210,12 @@ def _generic(horizon: int) -> Overrides:
 def override(config: Config, values: Overrides) -> Config:
     """The config with dotted settings replaced, all at once: `override(config, {"fit.learning_rate": 1e-3})`.
 
+    A budget of `iterations` takes the place of one of `real_steps`.
+
     Raises `ConfigError` for an unknown setting, a value of the wrong type or an impossible one.
     """
+    if config.real_steps and "iterations" in values and "real_steps" not in values:
+        values = {**values, "real_steps": None}
     return cast(Config, _replaced(config, values, ""))
 
 

@@ -46,7 +46,7 @@ ACTOR_CRITIC: Overrides = {
     "validate.rule": "no_early",
     "validate.starts": 10,
 }
-"""For episodes of 1,000 steps, 50,000 real steps in all (docs/actor-critic.md)."""
+"""`metrpo.presets` adds what depends on the length of episodes (docs/actor-critic.md)."""
 
 SYSTEMS: dict[str, Overrides] = {
     "me-trpo": {},

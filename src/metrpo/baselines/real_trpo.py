@@ -58,7 +58,7 @@ def step(config: Config, task: Task, state: TRPOState, progress: Progress = SILE
     with clock("collect"):
         enough, at_most = budget.steps_wanted(config, state.real_steps), budget.steps_left(config, state.real_steps)
         progress.stage("collect", enough)
-        rng, longest = rng_of(config.seed, iteration, Stage.COLLECT), config.collect.steps
+        rng, longest = rng_of(config.seed, iteration, Stage.COLLECT), budget.longest_episode(config, state.real_steps)
         drawn = on_policy.collect(task, state.policy, enough, rng, progress.update, longest, at_most)
     with clock("improve"):
         progress.stage("improve")

@@ -96,7 +96,8 @@ def step(config: Config, task: Task, state: SVGState, progress: Progress = SILEN
     progress.stage("learn", enough)
     while (steps := sum(len(e.rewards) for e in collected)) < enough:
         with clock("collect"):
-            drawn = on_policy.collect(task, state.policy, 1, rng, longest=config.collect.steps, at_most=left - steps)
+            longest = budget.longest_episode(config, state.real_steps)
+            drawn = on_policy.collect(task, state.policy, 1, rng, longest=longest, at_most=left - steps)
             collected += drawn.episodes
             most = config.collect.max_train
             replay = datasets.append(state.replay, drawn.episodes, most, carried=task.carried)

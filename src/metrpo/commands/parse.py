@@ -57,20 +57,27 @@ def _parse_run(kind: type[RunOptions], arguments: list[str], asked: str | None) 
 
     task = get_task(first.task, first.env_kwargs, first.imports).name
     of_task = {"env_kwargs": first.env_kwargs, "imports": first.imports}
-    system = _system(first, task, of_task, arguments)
+    asked_for = _asked(arguments)
+    system = _system(first, task, of_task, asked_for)
     defaults = _defaults(kind, preset(task, first.preset, system, **of_task))
     if asked is not None:
         _show(kind, defaults, arguments[0], only)
+    if defaults.real_steps and "iterations" in asked_for:
+        defaults = dataclasses.replace(defaults, real_steps=None)
     parsed = understood(lambda: _tyro(kind, defaults, arguments), kind, arguments)
     return dataclasses.replace(parsed, task=task)
 
 
-def _system(options: RunOptions, task: str, of_task: Overrides, arguments: list[str]) -> str:
+def _asked(arguments: list[str]) -> set[str]:
+    """Names of the options that are given."""
+    named = (word.partition("=")[0] for word in arguments if word.startswith("--"))
+    return {option.removeprefix("--").replace("-", "_") for option in named}
+
+
+def _system(options: RunOptions, task: str, of_task: Overrides, asked: set[str]) -> str:
     """The system that is asked for by its name, or the usual one with what else is asked for."""
     from metrpo.presets import ONLY_ME_TRPO, usual_system
 
-    named = (word.partition("=")[0] for word in arguments if word.startswith("--"))
-    asked = {option.removeprefix("--").replace("-", "_") for option in named}
     if "system" in asked:
         return options.system
     return usual_system(task, options.preset, of_task | {name: getattr(options, name) for name in asked & ONLY_ME_TRPO})

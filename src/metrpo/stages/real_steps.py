@@ -33,7 +33,7 @@ def collect(
     """The real episodes of the next iteration: those that wait in `log`, and more until they have enough steps.
 
     Enough are `at_least`, or as many as the config asks for and its budget allows, less those `kept` for something
-    else. An episode of more steps than the config asks for is cut there, and so is the one that reaches the end of the
+    else. They are whole but for very long ones (`budget.longest_episode`) and the one that reaches the end of the
     budget. New ones go to `log` as they end; what a run that was stopped has collected is not collected again.
 
     An episode in which the environment gives NaN or infinity is left out for good: its seed would give the same again.
@@ -53,7 +53,7 @@ def collect(
                 # Each episode has randomness of its own, so that it is the same one after any interruption.
                 rngs = (rng_of(config.seed, state.iteration + 1, Stage.COLLECT, n) for n in itertools.count(number))
                 steps = sum(len(e.rewards) for e in episodes)
-                longest = config.collect.steps
+                longest = budget.longest_episode(config, state.real_steps)
                 with closing(real.play(task, explorer, rngs, longest, progress.played, at_most - steps)) as played:
                     _take(played, episodes, enough, log, progress)
         except EpisodeError as error:
