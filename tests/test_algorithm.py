@@ -320,6 +320,23 @@ def captured_fit(monkeypatch, config, iteration, dataset):
     return given
 
 
+def test_whoever_collects_more_fits_longer(monkeypatch, tiny):
+    """Up to four times: the models of a whole long episode are as good as those of a short one."""
+    for steps, rounds in ((0, 1), (39, 1), (79, 1), (80, 2), (130, 3), (160, 4), (4000, 4)):
+        assert ensemble_fit.rounds_for(TINY, steps) == rounds, steps
+    seen = []
+
+    def fit_ensemble(*args):
+        seen.append(args[-1])
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(algorithm, "fit_ensemble", fit_ensemble)
+    episodes = algorithm.collect(TINY, probe.PROBE, tiny.states[1], at_least=130)
+    with pytest.raises(KeyboardInterrupt):
+        algorithm.learn(TINY, probe.PROBE, tiny.states[1], episodes)
+    assert seen == [sum(len(e.rewards) for e in episodes)] == [140]
+
+
 @pytest.mark.parametrize(("every", "fresh"), [(5, [1, 6, 11]), (1, list(range(1, 12))), (0, []), (3, [1, 4, 7, 10])])
 def test_networks_start_afresh_in_every_nth_iteration(tiny, monkeypatch, every, fresh):
     config = override(TINY, {"fit.reinitialise_every": every})
@@ -342,7 +359,7 @@ def test_the_normaliser_is_of_the_training_data_alone(tiny, monkeypatch):
         states=dataset.validation.states + 1e3, deltas=dataset.validation.deltas * 1e3
     )
     given = captured_fit(monkeypatch, TINY, 2, dataset._replace(validation=garbage))
-    ensemble, train, validation, fit_config, _, _ = given
+    ensemble, train, validation, fit_config, *_ = given
     normaliser = ensemble.normaliser
     rows = dataset.train
     np.testing.assert_allclose(normaliser.state_mean, rows.states.mean(0), rtol=1e-4, atol=1e-6)

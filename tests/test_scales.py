@@ -238,7 +238,7 @@ def learn_at_once(monkeypatch):
     """Instead of what has to be compiled: a fit and a policy that depend on the dataset's states and origin alone."""
     two = np.zeros(2)
 
-    def fit(config, task, networks, dataset, iteration, progress):
+    def fit(config, task, networks, dataset, iteration, progress, steps):
         normaliser = ensembles.normaliser_of(dataset.train, 1e-8, 1e-8, task.unseen)
         return Ensemble(networks, normaliser), FitInfo(1, two, two, two, two > 1, two > 1)
 

@@ -100,13 +100,12 @@ def learn(
     """
     iteration = state.iteration + 1
     clock = clock or Clock()
-    state = _with_data(config, task, state, episodes)
+    state, steps = _with_data(config, task, state, episodes), sum(len(e.rewards) for e in episodes)
     with clock("fit"):
         progress.stage("fit", None)
-        ensemble, fitted = fit_ensemble(config, task, state.networks, state.dataset, iteration, progress)
+        ensemble, fitted = fit_ensemble(config, task, state.networks, state.dataset, iteration, progress, steps)
         require_finite("fit", iteration, "start anew with a lower fit.learning_rate", **ensemble._asdict())
     with clock("improve"):
-        steps = sum(len(e.rewards) for e in episodes)
         policy, baseline, improved = improve_policy(config, task, state, ensemble, progress, clock, steps)
         advice = "training cannot continue from this state: use smaller steps or start anew"
         require_finite("improve", iteration, advice, policy=policy, baseline=baseline)

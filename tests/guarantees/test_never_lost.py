@@ -15,7 +15,7 @@ import pytest
 
 import probe
 import tiny_run
-from metrpo import algorithm, external, training
+from metrpo import algorithm, budget, external, training
 from metrpo.checks.health import examine
 from metrpo.commands import main
 from metrpo.console import interrupt
@@ -27,6 +27,7 @@ from metrpo.model import ensemble as ensembles
 from metrpo.model.ensemble import Ensemble
 from metrpo.model.fit import FitInfo
 from metrpo.policy_phase import PhaseInfo
+from metrpo.presets import override
 from metrpo.run import machine
 from metrpo.run.directory import RunDirectory
 from metrpo.run.metrics import read_metrics
@@ -136,7 +137,7 @@ def _learn_nothing(monkeypatch):
     """In no time: models and policy stay as they are, and predict that nothing ever changes."""
     three = np.zeros(2)
 
-    def fit(config, task, networks, dataset, iteration, progress):
+    def fit(config, task, networks, dataset, iteration, progress, steps):
         n = ensembles.normaliser_of(dataset.train, 0.1, 0.1, ())
         return Ensemble(networks, n), FitInfo(1, three, three, three, three > 1, three > 1)
 
@@ -279,7 +280,7 @@ def test_what_cannot_go_on_does_not_say_so(tmp_path, taught, monkeypatch, capsys
 # ---------------------------------------------------------------- time
 
 
-LONG = 1000
+LONG = 1500
 
 
 @pytest.fixture
@@ -292,14 +293,16 @@ def long_task(monkeypatch):
     return task
 
 
-def test_only_episodes_longer_than_the_steps_asked_for_are_cut(long_task):
+def test_only_very_long_episodes_are_cut(long_task):
     config = dataclasses.replace(CONFIG, task="Long")
     state = training.init(config)
     episodes = algorithm.collect(config, long_task, state)
-    assert [len(e.rewards) for e in episodes] == [config.collect.steps]
+    assert [len(e.rewards) for e in episodes] == [budget.LONGEST]
     assert not episodes[0].terminated
-    assert [len(e.rewards) for e in algorithm.collect(config, long_task, state, at_least=100)] == [80, 80]
-    short = dataclasses.replace(config, collect=dataclasses.replace(config.collect, steps=30), task="Probe")
+    assert [len(e.rewards) for e in algorithm.collect(config, long_task, state, at_least=1001)] == [1000, 1000]
+    more = override(config, {"collect.steps": 1200})
+    assert [len(e.rewards) for e in algorithm.collect(more, long_task, state)] == [1200]
+    short = override(config, {"collect.steps": 30, "task": "Probe"})
     assert [len(e.rewards) for e in algorithm.collect(short, probe.PROBE, state)] == [20, 20], (
         "a whole one may go beyond"
     )

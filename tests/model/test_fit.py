@@ -16,14 +16,15 @@ from metrpo.model import ensemble as ensembles
 from metrpo.model import fit as fitting
 from metrpo.model.ensemble import Ensemble
 from metrpo.model.epochs import minibatch, train_and_validate
+from metrpo.speed.measure import compilations
 from metrpo.types import Transitions
 
 KEY = jax.random.key(0)
 
 
-def fit(*args):
+def fit(*args, **more):
     """The fit with its results as NumPy arrays: every operation on a JAX array would be compiled by itself."""
-    return jax.device_get(fitting.fit(*args))
+    return jax.device_get(fitting.fit(*args, **more))
 
 
 def slow_validation_loss(ensemble, validation, loss_units="raw"):
@@ -299,6 +300,21 @@ def test_capacity_beyond_the_size_has_no_influence():
     roomy = fit(ensemble, padded(train, 100), padded(validation, 1500), SHORT, KEY)
     for ours, theirs in zip(jax.tree.leaves(roomy), jax.tree.leaves(exact), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-6)
+
+
+@pytest.mark.parametrize("decay", [False, True])
+def test_rounds_are_so_many_times_the_steps_and_compile_nothing_anew(decay):
+    train, validation = a_system(60)[0], a_system(30, seed=1)[0]
+    ensemble = random_ensemble(1)._replace(normaliser=ensembles.normaliser_of(train, 0.1, 0.1))
+    config = replace(SHORT, max_steps=6, max_passes=100, patience=100, decay=decay)
+    once = fit(ensemble, train, validation, config, KEY)
+    with compilations() as seen:
+        thrice = fit(ensemble, train, validation, config, KEY, rounds=3)
+    assert not seen
+    as_one = fit(ensemble, train, validation, replace(config, max_steps=18), KEY)
+    assert thrice[1].passes == as_one[1].passes == -(-18 // (60 // config.batch_size)) > once[1].passes
+    for ours, theirs in zip(jax.tree.leaves(thrice), jax.tree.leaves(as_one), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
 
 
 def test_the_callers_arrays_stay_usable():

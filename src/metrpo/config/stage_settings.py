@@ -104,9 +104,10 @@ class FitConfig:
     max_passes: int = 2000
     """Maximum number of epochs in one outer iteration."""
     max_steps: int | None = None
-    """Maximum number of minibatches in one outer iteration. Warm starts carry training on across iterations."""
+    """Maximum number of minibatches in one outer iteration; two, three or four times as many where it collected so many
+    times `collect.steps`. Warm starts carry training on across iterations."""
     decay: bool = False
-    """Let the step size fall to 0 over max_steps, as half a cosine: large steps learn fast, small ones end well."""
+    """Let the step size fall to 0 over the steps of a fit, as half a cosine: large steps learn fast, small ones end well."""
     reinitialise_every: int = 5
     """Start from fresh weights in every n-th outer iteration (1, 1+n, ...), else from the last ones; 0: fresh only in
     the first."""

@@ -36,6 +36,8 @@ class FitData(NamedTuple):
     train: Transitions
     validation: Transitions
     activation: Activation
+    most: Int[Array, ""]
+    """Minibatches of the whole fit, over which `config.decay` lets the step size fall."""
 
     def ensemble(self, networks: Networks) -> Ensemble:
         """Of networks that are being fitted."""
@@ -118,7 +120,7 @@ def _block(
     config: FitConfig,
 ) -> FitState:
     """One device's share of `train_and_validate`."""
-    optimizer = optimizer_of(config)
+    optimizer = optimizer_of(config, data.most)
     members = at.best_loss.shape[0]
     first = jax.lax.axis_index(AXIS) * members
     block_key = jax.random.fold_in(key, passes)
@@ -172,11 +174,13 @@ def _joined(parts: list[Any]) -> Any:
     return jax.tree.map(lambda *a: jnp.concatenate(a) if a[0].ndim else a[0], *parts)
 
 
-def optimizer_of(config: FitConfig) -> optax.GradientTransformation:
-    """Adam, with weight decay on the weights alone, which falls with the step size."""
-    rate: optax.ScalarOrSchedule = config.learning_rate
-    if config.decay and config.max_steps is not None:
-        rate = optax.cosine_decay_schedule(config.learning_rate, config.max_steps)
+def optimizer_of(config: FitConfig, most: Int[Array, ""]) -> optax.GradientTransformation:
+    """Adam for `most` steps, with weight decay on the weights alone, which falls with the step size."""
+
+    def falling(count: Int[Array, ""]) -> Float[Array, ""]:
+        return config.learning_rate * 0.5 * (1.0 + jnp.cos(jnp.pi * jnp.minimum(count / most, 1.0)))
+
+    rate: optax.ScalarOrSchedule = falling if config.decay else config.learning_rate
     return optax.adamw(rate, weight_decay=config.weight_decay, mask=_weights_only)
 
 

@@ -46,25 +46,27 @@ def fit(
     config: FitConfig,
     key: Key[Array, ""],
     on_validation: Callable[[int, Float[Array, "K"]], None] = lambda passes, losses: None,
+    rounds: int = 1,
 ) -> tuple[Ensemble, FitInfo]:
     """The ensemble fitted to `train` from the weights it has, each member at its own best validation loss.
 
     Stops when no member has improved for `config.patience` passes, at the latest after `config.max_passes` or
-    `config.max_steps`.
+    `rounds` times `config.max_steps`.
     `on_validation(passes, best losses)` is called at every validation. Adam starts afresh. Members are spread over
     JAX's devices where their number allows, as the paper suggests (appendix "Real-time complexity").
     """
-    optimizer = optimizer_of(config)
-    networks, data = ensemble.networks, FitData(ensemble.normaliser, train, validation, ensemble.activation)
+    # At least one step a pass: the first iterations of a small task may have fewer transitions than a minibatch.
+    steps_per_pass = max(1, int(train.size) // config.batch_size)
+    most = config.max_passes * steps_per_pass
+    most = most if config.max_steps is None else min(most, rounds * config.max_steps)
+    falls_over = jnp.int32(most if config.max_steps is None else rounds * config.max_steps)
+    optimizer = optimizer_of(config, falls_over)
+    networks, data = ensemble.networks, FitData(ensemble.normaliser, train, validation, ensemble.activation, falls_over)
     loss = validation_loss(data.ensemble(networks), validation, config.loss_units)
     at = FitState(networks, optimizer.init(networks), networks, loss, jnp.zeros(loss.shape, jnp.int32), loss)
     at = jax.tree.map(jnp.copy, at)  # its buffers are given away below, the caller's are not
     mesh = devices.mesh(loss.size)
     at, data = devices.shared(at, mesh), devices.copied(data, mesh)
-    # At least one step a pass: the first iterations of a small task may have fewer transitions than a minibatch.
-    steps_per_pass = max(1, int(train.size) // config.batch_size)
-    most = config.max_passes * steps_per_pass
-    most = most if config.max_steps is None else min(most, config.max_steps)
     steps = passes = 0
     while steps < most and passes - int(at.best_pass.max()) < config.patience:
         block = min(config.validate_every * steps_per_pass, most - steps)
@@ -87,6 +89,7 @@ def refit(
     validation: Transitions,
     config: FitConfig,
     key: Key[Array, ""],
+    rounds: int = 1,
 ) -> tuple[Ensemble, FitInfo]:
     """A fitted ensemble with its lost members fitted again, by themselves, from theirs of `fresh`.
 
@@ -102,7 +105,7 @@ def refit(
     normaliser = jax.tree.map(np.asarray, ensemble.normaliser)
     chosen = jax.tree.map(lambda x: np.asarray(x)[lost], fresh)
     start = ensemble._replace(networks=chosen, normaliser=normaliser)
-    again, second = fit(start, train, validation, config, key)
+    again, second = fit(start, train, validation, config, key, rounds=rounds)
     networks = jax.tree.map(lambda old, new: jnp.asarray(put(old, new)), ensemble.networks, again.networks)
     merged = FitInfo(
         passes=info.passes + second.passes,

@@ -20,12 +20,15 @@ from metrpo.world.dataset import Dataset
 from metrpo.world.task import Task
 
 _log = logging.getLogger("metrpo")
+_ROUNDS = 4
+"""`fit.max_steps` at most in one iteration, however much it collected."""
 
 
 def fit_ensemble(
-    config: Config, task: Task, networks: Networks, dataset: Dataset, iteration: int, progress: Progress
+    config: Config, task: Task, networks: Networks, dataset: Dataset, iteration: int, progress: Progress, steps: int = 0
 ) -> tuple[Ensemble, FitInfo]:
-    """The ensemble fitted to the dataset; members that diverge are fitted once more, from fresh weights.
+    """The ensemble fitted to the dataset, which has `steps` new real steps; members that diverge are fitted once more,
+    from fresh weights.
 
     Raises `DivergedError` where they diverge again.
     """
@@ -40,14 +43,15 @@ def fit_ensemble(
     def tell(passes: int, losses: Array) -> None:
         progress.update(passes, f"validation loss {float(np.mean(losses)):.4g}")
 
-    ensemble, info = fit(ensemble, train, validation, config.fit, fit_key, tell)
+    rounds = rounds_for(config, steps)
+    ensemble, info = fit(ensemble, train, validation, config.fit, fit_key, tell, rounds)
     if (survived := info.diverged & ~info.lost).any():
         _log.warning("fit, iteration %d: %s diverged and kept their best weights", iteration, _named(survived))
     if info.lost.any():
         _log.warning("fit, iteration %d: %s diverged; re-initialised and fitted again", iteration, _named(info.lost))
         init_key, fit_key = jax.random.split(key_of(config.seed, iteration, Stage.RESET))
         fresh = fresh_networks(config, task, init_key)
-        ensemble, info = refit(ensemble, info, fresh, train, validation, config.fit, fit_key)
+        ensemble, info = refit(ensemble, info, fresh, train, validation, config.fit, fit_key, rounds)
     if info.lost.any():
         largest = float(np.abs(dataset.train.deltas).max())
         raise DivergedError(
@@ -56,6 +60,11 @@ def fit_ensemble(
             f"(largest change of a state: {largest:.3g})"
         )
     return ensemble, info
+
+
+def rounds_for(config: Config, steps: int) -> int:
+    """How many times `fit.max_steps` an iteration may take that collected `steps` real steps."""
+    return min(max(1, steps // config.collect.steps), _ROUNDS)
 
 
 def _named(members: np.ndarray) -> str:
