@@ -106,7 +106,7 @@ def test_what_a_system_changes_is_what_it_reads():
     [
         ({"trpo.max_kl": 0.02}, "trpo.max_kl is a setting of the improver trpo; it has no effect on this run"),
         ({"validate.patience": 9}, "validate.patience is a setting of me-trpo; it has no effect on this run"),
-        ({"actor_critic.block": 10, "seed": 4, "fit.patience": 3}, None),
+        ({"actor_critic.block": 10, "seed": 4, "fit.max_steps": 300}, None),
     ],
 )
 def test_who_changes_a_setting_in_vain_is_told(settings, message, caplog):

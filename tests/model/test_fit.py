@@ -244,6 +244,7 @@ def test_a_diverged_member_keeps_its_best_weights():
         ([[30], []], {}, 25),
         ([range(5, 2000, 5), []], {"max_passes": 40}, 40),
         ([[3], []], {"validate_every": 3, "patience": 7}, 12),
+        ([[3], []], {"validate_every": 3, "patience": 7, "decay": True, "max_steps": 60}, 20),
         # 30 minibatches are 10 passes of 3; the 31st begins the eleventh
         ([range(5, 2000, 5), []], {"max_steps": 30}, 10),
         ([range(5, 2000, 5), []], {"max_steps": 31}, 11),

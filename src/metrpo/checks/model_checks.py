@@ -82,8 +82,14 @@ def models_blind(rows: Sequence[Row], config: Config) -> Concern | None:
         f"Model error {short(error[-1])} times that of predicting no change, after a single step on held-out episodes",
         "the models do not know what an action does, so the policy learns in a world of its own",
         "check the data first (do state, action and next state belong together? are there outliers?), then fit longer "
-        "(fit.max_passes, fit.patience) or lower fit.learning_rate",
+        f"({_limits(config)}) or lower fit.learning_rate",
     )
+
+
+def _limits(config: Config) -> str:
+    """The settings that end a fit."""
+    steps = ["fit.max_steps"] if config.fit.max_steps is not None else []
+    return ", ".join([*steps, *([] if config.fit.decay else ["fit.patience", "fit.max_passes"])])
 
 
 def unfit_dimensions(rows: Sequence[Row], config: Config) -> Concern | None:
@@ -120,7 +126,7 @@ def member_apart(rows: Sequence[Row], config: Config) -> Concern | None:
         since,
         f"Validation loss of model {k} is {short(losses[-1, k])}, {ratio[-1, k]:.1f} times the others' median",
         "one model of the ensemble is badly fitted, and any imagined step may use it",
-        "fit longer (fit.patience, fit.max_passes), lower fit.learning_rate, or start from fresh weights more often "
+        f"fit longer ({_limits(config)}), lower fit.learning_rate, or start from fresh weights more often "
         "(fit.reinitialise_every)",
     )
 
@@ -141,7 +147,7 @@ def loss_rises(rows: Sequence[Row], config: Config) -> Concern | None:
         since,
         f"Validation loss {short(middle[-1])}, {times[-1]:.1f} times its lowest",
         "the policy visits states that the models know little about, or fitting stops too soon",
-        "fit longer (fit.patience, fit.max_passes), use larger models (ensemble.hidden), raise collect.steps",
+        f"fit longer ({_limits(config)}), use larger models (ensemble.hidden), raise collect.steps",
     )
 
 

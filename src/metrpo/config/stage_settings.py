@@ -100,14 +100,14 @@ class FitConfig:
     validate_every: int = 5
     """Epochs between two validations."""
     patience: int = 25
-    """Stop when no model has improved its validation loss for this many epochs."""
+    """Stop when no model has improved its validation loss for this many epochs; not with decay."""
     max_passes: int = 2000
     """Maximum number of epochs in one outer iteration."""
     max_steps: int | None = None
     """Maximum number of minibatches in one outer iteration; two, three or four times as many where it collected so many
     times `collect.steps`. Warm starts carry training on across iterations."""
     decay: bool = False
-    """Let the step size fall to 0 over the steps of a fit, as half a cosine: large steps learn fast, small ones end well."""
+    """Let the step size fall to 0 within a fit, as half a cosine: large steps learn fast, small ones end well."""
     reinitialise_every: int = 5
     """Start from fresh weights in every n-th outer iteration (1, 1+n, ...), else from the last ones; 0: fresh only in
     the first."""

@@ -53,6 +53,7 @@ _READERS = {
     "fit.batch_size": _MODEL,
     "fit.learning_rate": _MODEL,
     "fit.loss_units": _MODEL,
+    "fit.patience": Reader(lambda c: _ENSEMBLE.reads(c) and not c.fit.decay, "fits without fit.decay"),
     "gradient": Reader(
         lambda c: c.method == "svg" or (c.method == "model-based" and c.improver != "trpo"), "every improver but trpo"
     ),

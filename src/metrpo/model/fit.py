@@ -51,7 +51,7 @@ def fit(
     """The ensemble fitted to `train` from the weights it has, each member at its own best validation loss.
 
     Stops when no member has improved for `config.patience` passes, at the latest after `config.max_passes` or
-    `rounds` times `config.max_steps`.
+    `rounds` times `config.max_steps`; with `config.decay` only then, for it is the small steps that end well.
     `on_validation(passes, best losses)` is called at every validation. Adam starts afresh. Members are spread over
     JAX's devices where their number allows, as the paper suggests (appendix "Real-time complexity").
     """
@@ -68,7 +68,7 @@ def fit(
     mesh = devices.mesh(loss.size)
     at, data = devices.shared(at, mesh), devices.copied(data, mesh)
     steps = passes = 0
-    while steps < most and passes - int(at.best_pass.max()) < config.patience:
+    while steps < most and (config.decay or passes - int(at.best_pass.max()) < config.patience):
         block = min(config.validate_every * steps_per_pass, most - steps)
         steps += block
         passes = -(-steps // steps_per_pass)
