@@ -38,6 +38,7 @@ ACTOR_CRITIC: Overrides = {
     "fit.decay": True,
     "fit.max_steps": 400,
     "fit.weight_decay": 0.1,
+    "gradient.learning_rate": 1e-3,
     "imagine.start": "anywhere",
     "iterations": 189,
     "policy.hidden": (256, 256),
