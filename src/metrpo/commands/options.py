@@ -33,9 +33,9 @@ class RunOptions(Config):
     long-horizon: me-trpo for tasks of 1,000 steps, which fast leaves to the actor-critic."""
     system: Annotated[System, arg(metavar="NAME")] = "me-trpo"
     """The method: me-trpo; actor-critic, the usual one for episodes of more than 300 steps, Snake, Hopper, Ant and
-    the humanoids; or one to compare these with. trpo, ppo, ddpg, svg-1 and svg-inf learn without the ensemble; trpo, ppo
-    and ddpg learn from real steps only (ppo and ddpg are Stable-Baselines3's). The others, such as model-ppo and k-1,
-    change a few settings of me-trpo."""
+    the humanoids; or one to compare these with. trpo, ppo, ddpg, svg-1 and svg-inf learn without the ensemble; trpo,
+    ppo and ddpg learn from real steps only (ppo and ddpg are Stable-Baselines3's). The others, such as model-ppo and
+    k-1, change a few settings of me-trpo."""
     method: Annotated[Method, arg(metavar="NAME")] = "model-based"
     """The training loop, which --system chooses: model-based (the paper's), or a baseline: trpo, svg, or
     Stable-Baselines3's ppo and ddpg."""
