@@ -89,7 +89,6 @@ def refit(
     validation: Transitions,
     config: FitConfig,
     key: Key[Array, ""],
-    rounds: int = 1,
 ) -> tuple[Ensemble, FitInfo]:
     """A fitted ensemble with its lost members fitted again, by themselves, from theirs of `fresh`.
 
@@ -105,7 +104,7 @@ def refit(
     normaliser = jax.tree.map(np.asarray, ensemble.normaliser)
     chosen = jax.tree.map(lambda x: np.asarray(x)[lost], fresh)
     start = ensemble._replace(networks=chosen, normaliser=normaliser)
-    again, second = fit(start, train, validation, config, key, rounds=rounds)
+    again, second = fit(start, train, validation, config, key)
     networks = jax.tree.map(lambda old, new: jnp.asarray(put(old, new)), ensemble.networks, again.networks)
     merged = FitInfo(
         passes=info.passes + second.passes,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 
 import jax
@@ -51,7 +52,9 @@ def fit_ensemble(
         _log.warning("fit, iteration %d: %s diverged; re-initialised and fitted again", iteration, _named(info.lost))
         init_key, fit_key = jax.random.split(key_of(config.seed, iteration, Stage.RESET))
         fresh = fresh_networks(config, task, init_key)
-        ensemble, info = refit(ensemble, info, fresh, train, validation, config.fit, fit_key, rounds)
+        most = config.fit.max_steps
+        longer = dataclasses.replace(config.fit, max_steps=None if most is None else rounds * most)
+        ensemble, info = refit(ensemble, info, fresh, train, validation, longer, fit_key)
     if info.lost.any():
         largest = float(np.abs(dataset.train.deltas).max())
         raise DivergedError(
