@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
@@ -27,7 +28,7 @@ from metrpo.run.lock import hold
 from metrpo.run.metrics import read_metrics, to_csv
 from metrpo.tune import trials as tuning
 from metrpo.tune.picture import draw
-from metrpo.tune.results import ENOUGH
+from metrpo.tune.results import ENOUGH, describe
 from metrpo.tune.search import Search, from_file, worth
 from metrpo.tune.space import Choices, Range, span_of
 from metrpo.tune.study import FILE
@@ -205,6 +206,14 @@ def test_a_file_says_the_same_as_options(tmp_path):
     (one, two) = found.runs(7, {"trpo.max_kl": 0.01, "ensemble.hidden": (16, 16)})
     assert (one.name, two.name) == ("Swimmer/trial-007/seed-0", "Swimmer/trial-007/seed-2")
     assert (two.config.real_steps, two.config.imagine.steps, two.config.ensemble.hidden) == (6000, 500, (16, 16))
+
+
+def test_a_long_task_has_as_few_iterations_as_whole_episodes(tmp_path):
+    """Pruning begins after a third of a run: counted in iterations of 250 steps, that would be after its end."""
+    found = Search("HalfCheetah-v5", {"fit.max_steps": Choices((400, 800))})
+    assert (found.base.real_steps, found.steps) == (50_000, 50)
+    assert "50,000 real steps each" in describe(found, tmp_path)
+    assert dataclasses.replace(found, iterations=7).steps == 7
 
 
 @pytest.mark.parametrize(

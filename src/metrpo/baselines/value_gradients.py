@@ -93,10 +93,10 @@ def step(config: Config, task: Task, state: SVGState, progress: Progress = SILEN
     collected: list[Episode] = []
     losses, norms, finite = [], [], []
     enough, left = budget.steps_wanted(config, state.real_steps), budget.steps_left(config, state.real_steps)
+    longest = budget.longest_episode(config, state.real_steps)
     progress.stage("learn", enough)
     while (steps := sum(len(e.rewards) for e in collected)) < enough:
         with clock("collect"):
-            longest = budget.longest_episode(config, state.real_steps)
             drawn = on_policy.collect(task, state.policy, 1, rng, longest=longest, at_most=left - steps)
             collected += drawn.episodes
             most = config.collect.max_train

@@ -17,10 +17,11 @@ class Reader(NamedTuple):
 
 
 _ENSEMBLE = Reader(lambda c: c.method == "model-based", "methods that learn in the ensemble")
-_PHASE = Reader(lambda c: c.method == "model-based" and not c.by_critics, "me-trpo")
-_MODEL = Reader(lambda c: c.method in ("model-based", "svg"), "methods that learn models")
-_CRITICS = Reader(lambda c: c.method == "model-based" and c.by_critics, "actor-critic")
-_TRPO = Reader(lambda c: "trpo" in (c.method, c.improver if c.method == "model-based" else ""), "the improver trpo")
+_PHASE = Reader(lambda c: _ENSEMBLE.reads(c) and not c.by_critics, "me-trpo")
+_SVG = Reader(lambda c: c.method == "svg", "svg-1 and svg-inf")
+_MODEL = Reader(lambda c: _ENSEMBLE.reads(c) or _SVG.reads(c), "methods that learn models")
+_CRITICS = Reader(lambda c: _ENSEMBLE.reads(c) and c.by_critics, "actor-critic")
+_TRPO = Reader(lambda c: c.method == "trpo" or (_PHASE.reads(c) and c.improver == "trpo"), "the improver trpo")
 _SCORES = Reader(lambda c: _PHASE.reads(c) and c.improver in ("trpo", "ppo", "vpg"), "the improvers trpo, ppo and vpg")
 _ADVANTAGES = Reader(lambda c: c.method == "trpo" or _PHASE.reads(c), "me-trpo and trpo")
 _NETWORK = Reader(
@@ -55,7 +56,7 @@ _READERS = {
     "fit.loss_units": _MODEL,
     "fit.patience": Reader(lambda c: _ENSEMBLE.reads(c) and not c.fit.decay, "fits without fit.decay"),
     "gradient": Reader(
-        lambda c: c.method == "svg" or (c.method == "model-based" and c.improver != "trpo"), "every improver but trpo"
+        lambda c: _SVG.reads(c) or (_ENSEMBLE.reads(c) and c.improver != "trpo"), "every improver but trpo"
     ),
     "imagine": _ENSEMBLE,
     "imagine.start": _PHASE,
@@ -68,8 +69,8 @@ _READERS = {
     "policy.mean_penalty": _SCORES,
     "policy.min_std": _PHASE,
     "policy.normalise": _ENSEMBLE,
-    "ppo": Reader(lambda c: c.method == "model-based" and c.improver == "ppo", "the improver ppo"),
-    "svg": Reader(lambda c: c.method == "svg", "svg-1 and svg-inf"),
+    "ppo": Reader(lambda c: _PHASE.reads(c) and c.improver == "ppo", "the improver ppo"),
+    "svg": _SVG,
     "trpo": _TRPO,
     "validate": _PHASE,
     "validate.real_episodes": _ENSEMBLE,

@@ -57,11 +57,10 @@ def fit(
     """
     # At least one step a pass: the first iterations of a small task may have fewer transitions than a minibatch.
     steps_per_pass = max(1, int(train.size) // config.batch_size)
-    most = config.max_passes * steps_per_pass
-    most = most if config.max_steps is None else min(most, rounds * config.max_steps)
-    falls_over = jnp.int32(most if config.max_steps is None else rounds * config.max_steps)
-    optimizer = optimizer_of(config, falls_over)
-    networks, data = ensemble.networks, FitData(ensemble.normaliser, train, validation, ensemble.activation, falls_over)
+    in_passes = config.max_passes * steps_per_pass
+    at_most = in_passes if config.max_steps is None else rounds * config.max_steps
+    data = FitData(ensemble.normaliser, train, validation, ensemble.activation, jnp.int32(at_most))
+    networks, optimizer, most = ensemble.networks, optimizer_of(config, data.most), min(in_passes, at_most)
     loss = validation_loss(data.ensemble(networks), validation, config.loss_units)
     at = FitState(networks, optimizer.init(networks), networks, loss, jnp.zeros(loss.shape, jnp.int32), loss)
     at = jax.tree.map(jnp.copy, at)  # its buffers are given away below, the caller's are not

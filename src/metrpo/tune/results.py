@@ -163,7 +163,8 @@ def _importance(study: Study, search: Search) -> dict[str, float]:
 def describe(search: Search, out: Path) -> str:
     """The search in words: its trials, its settings and ranges, and the command of a trial."""
     trials, seeds = counted(search.trials, "trial"), counted(len(search.seeds), "seed")
-    budget = counted(*((search.steps, "iteration") if search.real_steps is None else (search.real_steps, "real step")))
+    steps = search.base.real_steps
+    budget = counted(search.steps, "iteration") if steps is None else counted(steps, "real step")
     lines = [f"{out}: {trials} of {seeds}, {budget} each; the search covers"]
     usual = search.usual or {}
     for name, over in search.space.items():

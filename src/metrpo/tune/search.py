@@ -123,9 +123,12 @@ class Search:
 
     @property
     def steps(self) -> int:
-        """About how many iterations a run has."""
+        """About how many iterations a run has; at the fewest, where each plays a whole long episode."""
         base = self.base
-        return base.iterations if base.real_steps is None else math.ceil(base.real_steps / base.collect.steps)
+        if base.real_steps is None:
+            return base.iterations
+        longest = min(self._task().horizon, budget.longest_episode(base, base.real_steps))
+        return math.ceil(base.real_steps / max(base.collect.steps, longest))
 
     def is_spent(self, rows: Sequence[Row]) -> bool:
         """Whether a run with these rows of metrics has used up its budget."""
