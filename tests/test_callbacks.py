@@ -18,6 +18,8 @@ from metrpo.console import progress
 from metrpo.console.progress import SILENT, LiveProgress, PlainProgress
 from metrpo.run.metrics import read_metrics
 
+pytestmark = pytest.mark.usefixtures("plain_curve")
+
 
 @pytest.fixture(autouse=True)
 def _blank(monkeypatch):

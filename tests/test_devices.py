@@ -138,15 +138,7 @@ def probabilistic(ensemble):
     doubled = tuple(np.concatenate(pair, axis=-1) for pair in zip((weights, biases), spread, strict=True))
     return ensemble._replace(networks=(*inner, doubled))
 
-for members, count, hidden, sampling, curiosity in (
-    (3, 2, (16,), "step_rand", "history"),
-    (3, 4, (16,), "step_rand", 0.0),  # all three cut in four
-    (4, 2, (16,), "eps_rand", 0.0),  # two each
-    (5, 4, (16, 8, 8, 16), "step_rand", 0.1),
-    (3, 2, (16, 16), "step_rand", 0.0),  # one each, and one cut in two
-    (3, 2, (16,), "step_rand", "noise"),
-    (3, 4, (16,), "step_rand", "silu"),
-):
+for members, count, hidden, sampling, curiosity in CASES:
     ensemble = random_ensemble(members=members, scale=0.3, hidden=hidden)
     if curiosity == "history":
         ensemble, curiosity = of_one_observation(ensemble), 0.0
@@ -210,8 +202,21 @@ def test_each_device_imagines_rollouts_of_its_own(tmp_path):
     results(IMAGINE, 3, tmp_path / "out.npz")
 
 
-def test_cores_with_few_rows_share_wide_models(tmp_path):
-    results(WIDE, 4, tmp_path / "out.npz")
+MANY = [
+    (3, 2, (16,), "step_rand", "history"),
+    (3, 4, (16,), "step_rand", 0.0),  # all three cut in four
+    (4, 2, (16,), "eps_rand", 0.0),  # two each
+    (3, 4, (16,), "step_rand", "silu"),
+]
+FEW = [
+    (5, 4, (16, 8, 8, 16), "step_rand", 0.1),
+    (3, 2, (16, 16), "step_rand", "noise"),  # one each, and one cut in two
+]
+
+
+@pytest.mark.parametrize("cases", [FEW, pytest.param(MANY, marks=pytest.mark.slow)], ids=["few", "many"])
+def test_cores_with_few_rows_share_wide_models(cases, tmp_path):
+    results(f"CASES = {cases}\n{WIDE}", 4, tmp_path / "out.npz")
 
 
 def test_models_are_shared_where_their_units_can_be_divided():

@@ -192,6 +192,7 @@ def whole(tmp_path_factory):
     return run_dir
 
 
+@pytest.mark.slow
 def test_a_run_learns_what_comes_late(whole, tmp_path):
     train(config(history=1), tmp_path)
     blind, seeing = (read_metrics(run / "metrics.csv")[-1] for run in (tmp_path, whole))

@@ -12,7 +12,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, cast
 
-from metrpo.config import Config, Preset, System, convert, difference, flatten
+from metrpo.config import Config, Preset, System, convert, difference, flatten, types_of
 from metrpo.errors import ConfigError
 from metrpo.systems import PAPER as SYSTEMS_PAPER
 from metrpo.systems import SYSTEMS, Overrides
@@ -115,7 +115,7 @@ _SLOWER: Overrides = {"gradient.learning_rate": 3e-4}
 """With larger steps of the actor not measured yet."""
 BY_CRITICS: dict[str, Overrides] = {
     "Snake": {"iterations": 69, "actor_critic.entropy_target": -2.0} | _SLOWER,  # some 30,000 real steps
-    "Hopper": {"iterations": 74},  # some 25,000
+    "Hopper": {"iterations": 140},  # some 45,000
     "Ant": {"iterations": 43} | _SLOWER,  # some 15,000
     "Humanoid": {"iterations": 20} | _SLOWER,  # some 8,700
 }
@@ -233,7 +233,7 @@ def _replaced(node: Any, values: Overrides, section: str) -> Any:
         if dot:
             within.setdefault(first, {})[rest] = value
         else:
-            changes[first] = convert(typing.get_type_hints(type(node))[first], value, section + name)
+            changes[first] = convert(types_of(type(node))[first], value, section + name)
     for first, inner in within.items():
         changes[first] = _replaced(changes.get(first, getattr(node, first)), inner, f"{section}{first}.")
     return dataclasses.replace(cast(Any, node), **changes)

@@ -88,6 +88,7 @@ def test_episodes_lie_side_by_side_and_end_where_they_ended():
 # ---------------------------------------------------------------- TRPO
 
 
+@pytest.mark.slow
 def test_trpo_finds_the_probes_optimum_in_the_real_environment():
     told = Rows()
     state = training.train(TRPO, None, told)
@@ -122,6 +123,7 @@ def test_a_baseline_stops_at_its_budget_of_real_steps(config):
     assert (state.iteration, state.real_steps) == (1, 33)
 
 
+@pytest.mark.slow
 def test_svg_inf_learns_the_probe():
     told = Rows()
     state = training.train(SVG, None, told)

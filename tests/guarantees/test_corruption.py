@@ -223,7 +223,7 @@ def _trials(count, most):
     return lambda test: quiet(given(damages=st.lists(one, min_size=1, max_size=most))(test))
 
 
-@_trials(100, most=2)
+@_trials(40, most=2)
 def test_damaged_files_cost_an_iteration_at_most_or_are_named(real, damages):
     trial(real, [Damage(real.files[file], deed, number) for file, deed, number in damages])
 

@@ -208,17 +208,9 @@ def test_several_runs_are_asked_twice():
     assert told == ["stopping 1 run at the end of an iteration; press again to stop at once"]
 
 
-@pytest.mark.timeout(400)  # some 20 s of compilation on a quiet machine
-@pytest.mark.parametrize(("number", "code"), SIGNALS)
-def test_a_process_ends_so(number, code, tmp_path):
-    """Asked while it fits for the first time, which takes a while: it is compiled then.
-
-    The cache is empty, and one of the two has the command's own flags, as users have them.
-    """
-    line = tiny_run.process_line(tmp_path / "run", "--device", "cpu")
-    own = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS" or number != signal.SIGINT}
-    own |= {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")}
-    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=own) as process:
+def ends_so(run_dir, number, code, words, environment):
+    line = tiny_run.process_line(run_dir, "--device", "cpu", *words)
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment) as process:
         while not process.stdout.readline().endswith("fit\n"):
             assert process.poll() is None
         process.send_signal(number)
@@ -226,4 +218,19 @@ def test_a_process_ends_so(number, code, tmp_path):
     assert process.returncode == code
     assert "metrpo: stopping after this iteration; press again to stop at once" in err
     assert "The same command resumes.\n\n  metrpo train Probe --run-dir" in err
-    assert finished(tmp_path / "run") == [1]
+    assert finished(run_dir) == [1]
+
+
+@pytest.mark.parametrize(("number", "code"), SIGNALS)
+def test_a_process_ends_so(number, code, tmp_path):
+    """Asked while it fits, which takes a while with so many steps."""
+    words = [f"--fit.{name}=2_000" for name in ("max-steps", "max-passes", "patience")]
+    ends_so(tmp_path / "run", number, code, words, None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), SIGNALS)
+def test_a_process_that_compiles_ends_so(number, code, tmp_path):
+    """The cache is empty, and the flags are the command's own, as users have them."""
+    own = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    ends_so(tmp_path / "run", number, code, [], own | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache")})

@@ -6,6 +6,7 @@ import contextlib
 import sys
 
 import jax
+import jaxtyping
 import numpy as np
 import pytest
 
@@ -69,7 +70,7 @@ def _content(tree):
 
 @contextlib.contextmanager
 def cheap():
-    """What follows from the very same bytes is computed once; the curve is a text."""
+    """What follows from the very same bytes is computed once; the curve is a text; nobody checks array shapes."""
     learned, begun = {}, {}
     learn, init, append = algorithm.learn, algorithm.init, EpisodeLog.append
 
@@ -97,6 +98,7 @@ def cheap():
         patch.setattr(algorithm, "learn", learn_once)
         patch.setattr(algorithm, "init", init_once)
         patch.setattr(EpisodeLog, "append", counted_append)
+        patch.setattr(jaxtyping.config, "jaxtyping_disable", True)
         patch.setattr(lock, "source_commit", lambda: "a commit")
         patch.setattr(machine, "prepare", lambda *_, **__: None)
         patch.setattr(

@@ -496,6 +496,7 @@ def blind(monkeypatch):
     return task
 
 
+@pytest.mark.slow
 def test_the_probe_is_learned_without_knowing_its_reward(blind):
     """From 1,800 real steps to 1.01 to 1.04 times the Riccati loss (seeds 0 to 4); the first policy loses several."""
     optimum = probe.optimum()
@@ -535,6 +536,7 @@ def test_short_imagined_episodes_start_anywhere_and_are_more(blind, monkeypatch)
     )
 
 
+@pytest.mark.slow
 def test_the_probe_is_learned_in_episodes_of_five_steps(blind):
     """A fourth of its horizon: what follows the cut comes from the baseline."""
     optimum = probe.optimum()

@@ -3,7 +3,7 @@
 from metrpo.config.contradictions import require_consistent
 from metrpo.config.improver_settings import ActorCriticConfig, GradientConfig, PPOConfig, SVGConfig, TRPOConfig
 from metrpo.config.schema import BUDGET_FIELDS, Config, ImproverName, Method, Preset, System
-from metrpo.config.serialise import ADDED, convert, difference, flatten, from_json, to_json
+from metrpo.config.serialise import ADDED, convert, difference, flatten, from_json, to_json, types_of
 from metrpo.config.stage_settings import (
     AdvantageConfig,
     CollectConfig,
@@ -41,5 +41,6 @@ __all__ = [
     "from_json",
     "require_consistent",
     "to_json",
+    "types_of",
     "unread",
 ]

@@ -95,10 +95,15 @@ def difference(old: Config, new: Config) -> dict[str, tuple[Any, Any]]:
 _hints = functools.cache(typing.get_type_hints)
 
 
+def types_of(section: Any) -> dict[str, Any]:
+    """The type of each setting of a section, by its name."""
+    return _hints(section)
+
+
 def _build(cls: type, data: object, where: str) -> Any:
     if not isinstance(data, dict):
         raise ConfigError(f"{where}: expected an object with its settings, got {brief(data)}")
-    hints = _hints(cls)
+    hints = types_of(cls)
     names = [f.name for f in dataclasses.fields(cls)]
     missing = [n for n in names if n not in data and f"{where}.{n}" not in ADDED]
     wrong = [f"missing {n}" for n in missing] + [f"unknown {brief(n)[1:-1]}" for n in data if n not in names]

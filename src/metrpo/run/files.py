@@ -7,6 +7,7 @@ it, so that a file cut short or changed in any bit is refused.
 from __future__ import annotations
 
 import contextlib
+import functools
 import hashlib
 import io
 import json
@@ -181,6 +182,7 @@ def inside(folder: Path, file: str) -> Path | None:
     return None
 
 
+@functools.cache
 def metrpo_version() -> str:
     """The installed version, "unknown" when run from a bare source tree."""
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import logging
 import os
@@ -21,6 +22,7 @@ from metrpo.run.files import FORMAT, atomic_write, check_format, make_directory,
 from metrpo.safe_load import json_of, text_of
 
 _log = logging.getLogger("metrpo")
+_version = functools.cache(version)
 _POLL = 1.0
 """Seconds between two looks at a lock."""
 
@@ -125,7 +127,7 @@ def _check_or_describe(file: Path) -> None:
         return
     about = {"format": FORMAT, "metrpo": metrpo_version(), "commit": source_commit()}
     about["python"] = platform.python_version()
-    about |= {name: version(name) for name in ("jax", "mujoco", "gymnasium", "numpy")}
+    about |= {name: _version(name) for name in ("jax", "mujoco", "gymnasium", "numpy")}
     about["created"] = datetime.now(UTC).isoformat(timespec="seconds")
     atomic_write(file, json.dumps(about, indent=2) + "\n")
 

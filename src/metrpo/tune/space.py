@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import re
@@ -10,7 +11,7 @@ import typing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from metrpo.config import Config
+from metrpo.config import Config, types_of
 from metrpo.errors import ConfigError
 from metrpo.launch.grid import values_of
 
@@ -154,7 +155,7 @@ def _kind(name: str) -> Any:
     """The type of a setting, of one that may be None the other type."""
     kind: Any = Config
     for part in name.split("."):
-        hints = typing.get_type_hints(kind) if isinstance(kind, type) and kind not in (int, float, bool, str) else {}
+        hints = types_of(kind) if dataclasses.is_dataclass(kind) else {}
         if part not in hints:
             raise ConfigError(f"search: unknown setting {name!r} (see: metrpo train --help-all)")
         kind = hints[part]
