@@ -34,7 +34,7 @@ CHECKED = ("metrpo.model", "metrpo.policy", "metrpo.policy_phase")
 
 def pytest_configure(config: pytest.Config) -> None:
     os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
-    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.02")
+    os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
     if config.option.markexpr == "not slow":
         os.environ.setdefault("XLA_FLAGS", " ".join(CHEAP))
         install_import_hook(CHECKED, "shapes.check")

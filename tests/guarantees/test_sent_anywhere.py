@@ -81,7 +81,7 @@ def assert_it_can_go_on(uninterrupted, tmp_path, fault, numbers):
 
 @pytest.mark.parametrize("fault", ["kill", "power"])
 def test_broken_off_in_some_operations(uninterrupted, tmp_path, fault):
-    assert_it_can_go_on(uninterrupted, tmp_path, fault, lambda count: range(5, count + 1, 23))
+    assert_it_can_go_on(uninterrupted, tmp_path, fault, lambda count: range(5, count + 1, 41))
 
 
 @pytest.mark.slow
