@@ -40,8 +40,10 @@ def test_runs_grids_and_searches_agree_on_a_spent_budget(given, iteration, real_
         ("Swimmer", {"real_steps": 15_000}, 0, 0, None),
         ("Swimmer", {"real_steps": 15_000}, 2, 3000, 8),
         ("Swimmer", {"real_steps": 15_000}, 10, 15_000, 0),
-        # Its first iteration takes 3,000 random steps, the others 250.
-        ("Ant", {"real_steps": 20_000}, 1, 3000, 68),
+        # The first iteration takes 3,000 random steps, the others what whole episodes take: 250 to 1,000.
+        ("Ant", {"real_steps": 20_000}, 1, 3000, None),
+        ("HalfCheetah-v5", {"real_steps": 50_000}, 2, 4000, 46),
+        ("HalfCheetah-v5", {"real_steps": 50_000}, 25, 27_000, 23),
         ("Ant", {"real_steps": 20_000}, 41, 13_000, 28),
         ("Ant", {"real_steps": 2000}, 1, 2000, 0),
     ],

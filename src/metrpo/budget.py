@@ -57,12 +57,15 @@ def seconds_of_next(seconds: Sequence[float]) -> float | None:
 
 
 def iterations_left(config: Config, iteration: int, real_steps: int) -> int | None:
-    """About how many iterations follow; None where the first one has to say how many real steps one takes."""
+    """About how many iterations follow; None where the next one has to say how many real steps one takes."""
     if not config.real_steps:
         return config.iterations - iteration
     left = steps_left(config, real_steps)
-    if not real_steps:
+    if not left:
+        return 0
+    # The actor-critic's first iteration, of random actions, has other episodes than the rest.
+    apart = int(config.by_critics)
+    alike = iteration - apart
+    if alike < 1:
         return None
-    # The actor-critic's first iteration is longer than the others.
-    longer = max(0, steps_wanted(config, 0) - config.collect.steps)
-    return math.ceil(left * iteration / max(real_steps - longer, 1))
+    return math.ceil(left * alike / max(real_steps - apart * steps_wanted(config, 0), 1))
