@@ -57,6 +57,8 @@ def main() -> int:
     )  # 404.html is for a server
     if program is None or not pages:
         parser.error(f"expected Chromium and a built site (make docs), found {program} and {len(pages)} pages")
+    if missing := [str(page) for page in pages if not page.is_file()]:
+        parser.error(f"expected pages such as site/index.html, found no {', '.join(missing)}")
     given.out.mkdir(parents=True, exist_ok=True)
     wrong, answers = 0, dict[Path, dict[str, Any]]()
     with Browser(program) as browser:

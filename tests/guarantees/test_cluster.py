@@ -23,7 +23,7 @@ from places import SUPPORT
 
 pytestmark = [
     pytest.mark.slow,
-    pytest.mark.timeout(1200),
+    pytest.mark.timeout(1800),
     pytest.mark.skipif(find_spec("ray") is None, reason="needs Ray: make ray, or pip install 'metrpo[ray]'"),
 ]
 

@@ -75,7 +75,7 @@ def test_a_disk_that_fails_in_one_operation_of_seventy(uninterrupted, fault, tmp
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("fault", FAULTS, ids=names)
 def test_a_disk_that_fails_in_every_operation(uninterrupted, fault, tmp_path, caplog):
     for n in range(1, uninterrupted[1] + 1):

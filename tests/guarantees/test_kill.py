@@ -9,7 +9,7 @@ import time
 import pytest
 
 # Of the fast tests, guarantees/test_kill_anywhere.py kills processes, within single operations.
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 STAGES = ("collect", "fit", "improve", "evaluate")
 TINY = [

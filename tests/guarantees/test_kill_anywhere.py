@@ -77,7 +77,7 @@ def test_killed_again_and_again(uninterrupted, tmp_path, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("fault", ["kill", "power"])
 def test_killed_in_every_operation(uninterrupted, tmp_path, fault):
     every(uninterrupted, tmp_path, fault, range(1, len(uninterrupted[1]) + 1))
@@ -106,7 +106,7 @@ def test_a_log_added_half_way_is_added_once(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 def test_real_kills_at_random_moments(tmp_path):
     """24 times `kill -9`, at moments drawn from the time that the rest of the run takes, in 6 runs."""
     started = time.monotonic()

@@ -9,7 +9,7 @@ import pytest
 from metrpo import read_metrics
 from places import SUPPORT
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
 RUNS = 20
 TINY = {

@@ -40,7 +40,7 @@ print(json.dumps([Memory.resident, int(state.dataset.train.size), int(state.data
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="resident memory is read as Linux gives it")
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 def test_two_hundred_iterations_hold_no_more_memory_than_twenty(tmp_path):
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(SUPPORT), *sys.path])}
     done = subprocess.run(

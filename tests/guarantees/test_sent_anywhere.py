@@ -85,7 +85,7 @@ def test_broken_off_in_some_operations(uninterrupted, tmp_path, fault):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1200)
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("fault", ["kill", "power"])
 def test_broken_off_in_every_operation(uninterrupted, tmp_path, fault):
     assert_it_can_go_on(uninterrupted, tmp_path, fault, lambda count: range(1, count + 1))

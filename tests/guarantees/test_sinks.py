@@ -171,7 +171,7 @@ OUTPUTS = {
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(1800)
 def test_processes_whose_output_goes_nowhere(tmp_path):
     """`metrpo train ... | head -1`, a log on a full disk, no stdout: each run ends well, and is complete."""
     started = {name: shell(tmp_path / name, how) for name, (how, _) in OUTPUTS.items()}

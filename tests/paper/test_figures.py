@@ -355,7 +355,7 @@ def test_publishing_names_what_is_missing_and_shows_every_seed(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(1500)
+@pytest.mark.timeout(1800)
 def test_smoke_runs_every_system_and_draws_every_figure(tmp_path):
     """The command itself; without Stable-Baselines3 its two systems fail, and nothing else does."""
     done = subprocess.run(

@@ -563,7 +563,7 @@ def test_a_run_that_outlived_its_tune_is_stopped_and_taken_over(tmp_path, monkey
             held.wait()
 
 
-@pytest.mark.timeout(600)  # seconds on a free core; a machine that does other work needs longer
+@pytest.mark.timeout(1800)  # seconds on a free core; a machine that does other work needs longer
 @pytest.mark.slow
 def test_killed_with_its_run_tune_goes_on_from_the_checkpoint(tmp_path):
     out = tmp_path / "out"
