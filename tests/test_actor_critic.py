@@ -171,7 +171,7 @@ def test_its_steps_one_at_a_time_are_the_loop_byte_for_byte(tmp_path):
         assert (whole / name).read_bytes() == (steps / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("settings", [{"learn_reward": True, "history": 2}, {"actor_critic.horizon": 0}])
+@pytest.mark.parametrize("settings", [{"learn_reward": True}, {"history": 2}, {"actor_critic.horizon": 0}])
 def test_it_learns_rewards_sees_the_past_and_does_without_imagined_steps(settings, tmp_path):
     train(override(SMALL, {"iterations": 2, **settings}), tmp_path)
     row = read_metrics(tmp_path / "metrics.csv")[-1]

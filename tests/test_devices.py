@@ -206,11 +206,12 @@ MANY = [
     (3, 2, (16,), "step_rand", "history"),
     (3, 4, (16,), "step_rand", 0.0),  # all three cut in four
     (4, 2, (16,), "eps_rand", 0.0),  # two each
+    (3, 2, (16, 16), "step_rand", 0.0),  # one each, and one cut in two
     (3, 4, (16,), "step_rand", "silu"),
 ]
 FEW = [
     (5, 4, (16, 8, 8, 16), "step_rand", 0.1),
-    (3, 2, (16, 16), "step_rand", "noise"),  # one each, and one cut in two
+    (3, 2, (16,), "step_rand", "noise"),
 ]
 
 

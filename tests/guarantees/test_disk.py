@@ -68,10 +68,10 @@ def one_failure(uninterrupted, run_dir, fault, n, caplog):
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=names)
-def test_a_disk_that_fails_in_one_operation_of_seventy(uninterrupted, fault, tmp_path, caplog):
-    numbers = range(7 + 23 * FAULTS.index(fault), uninterrupted[1], 70)
+def test_a_disk_that_fails_in_one_operation_of_forty(uninterrupted, fault, tmp_path, caplog):
+    numbers = range(7 + 13 * FAULTS.index(fault), uninterrupted[1], 40)
     failed = [one_failure(uninterrupted, tmp_path / str(n) / "new" / "run", fault, n, caplog) for n in numbers]
-    assert sum(failed) > 0.6 * len(numbers) > 1
+    assert sum(failed) > 0.6 * len(numbers) > 3
 
 
 @pytest.mark.slow

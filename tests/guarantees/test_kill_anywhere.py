@@ -63,9 +63,9 @@ def test_what_is_counted_is_what_the_run_does(uninterrupted):
 
 
 @pytest.mark.parametrize("fault", ["kill", "power"])
-def test_killed_in_one_operation_of_thirty(uninterrupted, tmp_path, fault):
+def test_killed_in_one_operation_of_seventeen(uninterrupted, tmp_path, fault):
     operations = len(uninterrupted[1])
-    assert every(uninterrupted, tmp_path, fault, range(3 + 15 * (fault == "power"), operations + 1, 30)) > 6
+    assert every(uninterrupted, tmp_path, fault, range(3 + 8 * (fault == "power"), operations + 1, 17)) > 12
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -229,6 +229,7 @@ def test_a_process_ends_so(number, code, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize(("number", "code"), SIGNALS)
 def test_a_process_that_compiles_ends_so(number, code, tmp_path):
     """The cache is empty, and the flags are the command's own, as users have them."""
