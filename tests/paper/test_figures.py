@@ -21,7 +21,8 @@ from metrpo.launch import local
 from metrpo.launch.backend import Means
 from metrpo.launch.run_spec import RunSpec
 from metrpo.launch.status import has_spent, standing
-from metrpo.paper.figures import FIGURES, PAPER_SECONDS, SCALES, runs_of
+from metrpo.paper import pictures
+from metrpo.paper.figures import FIGURES, PAPER_SECONDS, SCALES, run_of, runs_of
 from metrpo.paper.pictures import draw
 from metrpo.paper.publish import publish
 from metrpo.paper.summary import curves_of, mean_curve, summarise
@@ -73,7 +74,7 @@ def test_every_system_is_in_a_figure_and_every_figure_has_some():
         assert set(scale.tasks) <= set(tasks())
         assert {s for row in scale.iterations.values() for s in row} <= set(SYSTEMS) | {"*"}
         assert set(scale.iterations) <= set(tasks()) | {"*"}
-        assert set(scale.without) <= set(SYSTEMS)
+        assert set(scale.seeds) <= set(SYSTEMS) | {"*"}
     assert set(PAPER_SECONDS) == set(FIGURES["wall-clock"].tasks)
 
 
@@ -93,8 +94,29 @@ def test_figures_share_runs_and_the_first_seeds_come_first():
     assert len(found) == len(set(found))
     assert [r.seed for r in found] == sorted(r.seed for r in found)
     one = runs_of("ensemble-size", "laptop", ("Swimmer",), seeds=1)
-    assert [r.name for r in one] == [f"Swimmer/{s}/seed-0" for s in ("me-trpo", "k-1", "k-10")]
+    assert [r.name for r in one] == [f"Swimmer/{s}/seed-0" for s in ("me-trpo", "k-1", "k-10", "k-20")]
     assert set(one) <= set(found)
+
+
+def test_a_scale_says_how_many_seeds_and_iterations_a_system_has():
+    found = runs_of("all", "laptop")
+
+    def seeds(task, system):
+        return [r.seed for r in found if (r.task, r.system) == (task, system)]
+
+    assert seeds("Hopper", "me-trpo") == [0, 1, 2, 3, 4]
+    assert seeds("Hopper", "svg-1") == [0, 1]
+    assert seeds("Hopper", "k-20") == [0, 1, 2]
+
+    def iterations(task, system):
+        return run_of("laptop", task, system, 0).config.iterations
+
+    assert iterations("Hopper", "k-1") == 15  # any task, any system
+    assert iterations("Snake", "k-1") == 10  # this task, any system
+    assert iterations("Snake", "trpo") == 200  # any task, this system: not Snake's 10
+    assert iterations("Swimmer", "trpo") == 60  # this task, this system
+    assert iterations("HalfCheetah", "me-trpo") == 20
+    assert len(runs_of("comparison", "laptop", ("Ant",), seeds=1)) == 6
 
 
 @pytest.mark.parametrize(
@@ -102,7 +124,7 @@ def test_figures_share_runs_and_the_first_seeds_come_first():
     [
         (("sampling", "huge"), "scale: expected one of smoke, laptop, paper, got 'huge'"),
         (("speed", "smoke"), "figure: expected one of all, comparison, .*, got 'speed'"),
-        (("sampling", "smoke", ("Hopper",)), "tasks: expected some of HalfCheetah, Swimmer, got Hopper"),
+        (("sampling", "smoke", ("Hopper",)), "tasks: expected some of Ant, HalfCheetah, Swimmer, got Hopper"),
     ],
 )
 def test_what_is_unknown_is_named(arguments, message):
@@ -330,6 +352,23 @@ def test_every_figure_is_drawn_from_what_there_is(tmp_path, name):
         write(tmp_path, run, np.arange(3 + i % 4), imagined=np.arange(3 + i % 4) * 5)
     assert draw(name, everything, tmp_path, tmp_path / "some.png")
     assert (tmp_path / "some.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_the_first_models_promise_flattens_no_panel(tmp_path, monkeypatch):
+    """A row for each task, a column for each system; what lies outside is said in words."""
+    drawn = []
+    monkeypatch.setattr(pictures, "png_of", lambda picture: drawn.append(picture) or b"")
+    two = runs("k-1", 2)
+    write(tmp_path, two[0], [0, 50, 100], imagined=[3000, 120, 110])
+    write(tmp_path, two[1], [10, 60, 90], imagined=[70, 100, 100])
+    (other,) = runs("me-trpo", 1, task="Ant")
+    write(tmp_path, other, [0, 50, 100], imagined=[30, 120, 110])
+    draw("overfitting", [*two, other], tmp_path, tmp_path / "o.png")
+    axes = {a.get_title(): a for a in drawn[0].axes if a.get_title()}
+    assert list(axes) == ["Swimmer, 1 model", "Ant, 5 models"]
+    assert axes["Swimmer, 1 model"].get_ylim() == (-6, 126)
+    assert [t.get_text() for t in axes["Swimmer, 1 model"].texts] == ["outside, after the first phase: 3,000"]
+    assert not axes["Ant, 5 models"].texts
 
 
 def test_publishing_names_what_is_missing_and_shows_every_seed(tmp_path):

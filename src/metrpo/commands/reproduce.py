@@ -30,7 +30,7 @@ class Reproduce:
     figure: Annotated[Positional[str], arg(metavar="FIGURE")]
     """Which figure, or all."""
     scale: Literal["smoke", "laptop", "paper"] = "laptop"
-    """smoke: takes minutes, learns nothing; laptop: hours on two cores; paper: as in the paper, weeks on two cores."""
+    """smoke: takes minutes, learns nothing; laptop: days on two cores; paper: as in the paper, weeks on two cores."""
     tasks: tuple[str, ...] = ()
     """Only these tasks of the figure; default: the scale's."""
     seeds: Annotated[int | None, arg(metavar="INT")] = None

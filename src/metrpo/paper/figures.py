@@ -53,19 +53,19 @@ FIGURES: dict[str, Figure] = {
             "BPTT": "bptt",
             "BPTT, stochastic": "bptt-stochastic",
         },
-        ("Swimmer", "HalfCheetah", "Ant"),
+        ("Swimmer", "HalfCheetah", "Hopper", "Ant"),
     ),
     "ensemble-size": Figure(
         "Number of models",
         "More models regularise better, and the return goes up with their number, most of all on HalfCheetah and Ant.",
         {"5 models": "me-trpo", "1 model": "k-1", "10 models": "k-10", "20 models": "k-20"},
-        ("Swimmer", "HalfCheetah", "Ant"),
+        ("Swimmer", "HalfCheetah", "Hopper", "Ant"),
     ),
     "overfitting": Figure(
         "Imagined and real return with one model",
         "With one model the imagined return rises in each policy phase while the real one falls.",
         {"1 model": "k-1", "5 models": "me-trpo"},
-        ("Swimmer", "HalfCheetah"),  # the paper shows Swimmer
+        PAPER_TASKS,  # the paper shows Swimmer
         kind="overfitting",
     ),
     "sampling": Figure(
@@ -79,7 +79,7 @@ FIGURES: dict[str, Figure] = {
             "eps_rand": "eps_rand",
             "one_model": "one_model",
         },
-        ("HalfCheetah", "Swimmer"),
+        ("HalfCheetah", "Ant", "Swimmer"),
     ),
     "validation": Figure(
         "When to stop improving the policy",
@@ -92,7 +92,7 @@ FIGURES: dict[str, Figure] = {
             "no_early_5": "validate-no_early_5",
             "one_model": "validate-one_model",
         },
-        ("HalfCheetah", "Swimmer"),
+        ("HalfCheetah", "Ant", "Swimmer"),
     ),
     "wall-clock": Figure(
         "Wall-clock time",
@@ -122,22 +122,22 @@ class Scale:
     """How much of the paper's work is done."""
 
     preset: Literal["fast", "paper"]
-    seeds: int
+    seeds: dict[str, int]
+    """System -> seeds; "*" stands for any other system."""
     tasks: tuple[str, ...]
     """Those that are run unless others are asked for."""
     iterations: dict[str, dict[str, int]] = field(default_factory=dict)
-    """Task -> system -> outer iterations, where they are not the preset's; "*" stands for any task or system."""
+    """Task -> system -> outer iterations, where they are not the preset's; "*" stands for any other task or system.
+    A system's number, of any task, goes before a task's for any system."""
     overrides: Overrides = field(default_factory=dict)
     """For every run."""
-    without: tuple[str, ...] = ()
-    """Systems that are left out."""
 
 
 SCALES: dict[str, Scale] = {
     # Does every system run at all? Nothing can be learned in so few steps.
     "smoke": Scale(
         "fast",
-        seeds=1,
+        seeds={"*": 1},
         tasks=("Swimmer",),
         iterations={"*": {"*": 2}},
         overrides={
@@ -153,19 +153,21 @@ SCALES: dict[str, Scale] = {
             "validate.starts": 5,
         },
     ),
-    # Hours on two cores.
+    # Days on two cores. The budgets end where the curves are flat, or where a run has taken an hour or two.
     "laptop": Scale(
         "fast",
-        seeds=2,
-        without=("k-20",),
-        tasks=("Swimmer", "HalfCheetah"),
+        seeds={"*": 3, "me-trpo": 5, "svg-1": 2, "svg-inf": 2},
+        tasks=PAPER_TASKS,
         iterations={
-            "Swimmer": {"trpo": 60, "svg-inf": 33, "svg-1": 10},
-            "HalfCheetah": {"*": 15, "me-trpo": 20, "trpo": 20, "ppo": 50, "ddpg": 60, "svg-inf": 33, "svg-1": 10},
+            "*": {"*": 15, "me-trpo": 20, "trpo": 200, "ppo": 98, "ddpg": 60, "svg-1": 33, "svg-inf": 33},
+            "Swimmer": {"*": 10, "me-trpo": 10, "trpo": 60, "ddpg": 200},
+            "Snake": {"*": 10, "me-trpo": 10},
+            "HalfCheetah": {"ddpg": 200},
+            "Humanoid": {"*": 10, "me-trpo": 10},
         },
     ),
     # As in the paper: weeks on two cores.
-    "paper": Scale("paper", seeds=3, tasks=PAPER_TASKS),
+    "paper": Scale("paper", seeds={"*": 3}, tasks=PAPER_TASKS),
 }
 
 
@@ -184,21 +186,21 @@ def runs_of(figure: str, scale: str, tasks: tuple[str, ...] = (), seeds: int | N
     if wrong := [task for task in tasks if task not in shown]:
         raise ConfigError(f"tasks: expected some of {', '.join(sorted(shown))}, got {wrong[0]}")
     found: dict[RunSpec, None] = {}
-    for seed in range(of.seeds if seeds is None else seeds):
-        for name in names:
-            for task in FIGURES[name].tasks:
-                if task in (tasks or of.tasks):
-                    systems = [s for s in FIGURES[name].systems.values() if s not in of.without]
-                    found |= {run_of(scale, task, system, seed): None for system in systems}
-    return list(found)
+    for name in names:
+        for task in FIGURES[name].tasks:
+            if task in (tasks or of.tasks):
+                for system in FIGURES[name].systems.values():
+                    enough = of.seeds.get(system, of.seeds["*"]) if seeds is None else seeds
+                    found |= {run_of(scale, task, system, seed): None for seed in range(enough)}
+    return sorted(found, key=lambda run: run.seed)
 
 
 def run_of(scale: str, task: str, system: str, seed: int) -> RunSpec:
     """The run of a task, system and seed at a scale."""
-    of, iterations = SCALES[scale], None
-    for row in (of.iterations.get("*", {}), of.iterations.get(task, {})):
-        iterations = row.get(system, row.get("*", iterations))
-    overrides = of.overrides | ({} if iterations is None else {"iterations": iterations})
+    of = SCALES[scale]
+    rows = (of.iterations.get(task, {}), of.iterations.get("*", {}))
+    said = [row[name] for name in (system, "*") for row in rows if name in row]
+    overrides = of.overrides | ({"iterations": said[0]} if said else {})
     return RunSpec(task, system, seed, tuple(overrides.items()), of.preset)
 
 

@@ -60,33 +60,55 @@ def _draw_curves(picture: Picture, figure: Figure, curves: list[Curves]) -> None
     picture.legend([handles[s] for s in shown], shown, loc="outside lower center", ncols=6, frameon=False, fontsize=9)
 
 
-def _draw_band(axes: Axes, curves: Curves, colour: str, log: bool) -> None:
+def _draw_band(
+    axes: Axes, curves: Curves, colour: str, log: bool = False, column: str = "return_real", label: str = ""
+) -> None:
     unit = 1 if log else 1000
-    for steps, returns in curves.column("return_real"):
+    for steps, returns in curves.column(column):
         axes.plot(steps / unit, returns, color=colour, linewidth=0.7, alpha=0.35)
-    steps, mean, low, high = mean_curve(curves, "return_real", log)
+    steps, mean, low, high = mean_curve(curves, column, log)
     axes.fill_between(steps / unit, low, high, color=colour, alpha=0.15, linewidth=0)
-    axes.plot(steps / unit, mean, color=colour, linewidth=2, label=curves.label)
+    axes.plot(steps / unit, mean, color=colour, linewidth=2, label=label or curves.label)
 
 
 def _draw_overfitting(picture: Picture, figure: Figure, curves: list[Curves]) -> None:
-    """Imagined and real return after every policy phase: a row for each system, a column for each seed."""
-    columns = max(len(c.runs) for c in curves)
-    picture.set_size_inches(3.8 * columns, 2.6 * len(curves))
-    grid = picture.subplots(len(curves), columns, squeeze=False)
-    for row, c in zip(grid, curves, strict=True):
-        for axes, (steps, real), (_, imagined), run in zip(
-            row, c.column("return_real"), c.column("return_imagined"), c.runs, strict=False
-        ):
-            axes.plot(steps / 1000, imagined, "s-", color=IMAGINED, markersize=4, label="imagined")
-            axes.plot(steps / 1000, real, "o-", color=REAL, markersize=4, label="real")
-            axes.set_title(f"{c.task}, {c.label}, seed {run.seed}", fontsize=10)
-            axes.set_ylabel("return")
-            axes.set_xlabel("real steps (thousands)")
-            tidy(axes)
-        for axes in row[len(c.runs) :]:
-            axes.set_axis_off()
-    grid[0][0].legend(frameon=False, fontsize=9)
+    """Imagined and real return after every policy phase: a row for each task, a column for each system."""
+    tasks, labels = list(dict.fromkeys(c.task for c in curves)), list(figure.systems)
+    picture.set_size_inches(4.6 * len(labels), 0.5 + 2.6 * len(tasks))
+    grid = picture.subplots(len(tasks), len(labels), squeeze=False)
+    for axes in grid.flat:
+        axes.set_axis_off()
+    for c in curves:
+        axes = grid[tasks.index(c.task)][labels.index(c.label)]
+        axes.set_axis_on()
+        tidy(axes)
+        _draw_band(axes, c, IMAGINED, column="return_imagined", label="imagined")
+        _draw_band(axes, c, REAL, label="real")
+        _leave_out_first_promises(axes, c)
+        axes.set_title(f"{c.task}, {c.label}", fontsize=10)
+        axes.set_ylabel("return")
+        axes.set_xlabel("real steps (thousands)")
+    handles, names = axes.get_legend_handles_labels()
+    picture.legend(handles, names, loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+
+
+def _leave_out_first_promises(axes: Axes, curves: Curves) -> None:
+    """Limits for all real returns and the imagined ones from the second phase on, and what lies outside in words.
+
+    What the first models promise would else flatten all that follows.
+    """
+    real = [returns for _, returns in curves.column("return_real")]
+    imagined = [returns for _, returns in curves.column("return_imagined")]
+    first = np.array([returns[0] for returns in imagined])
+    shown = np.concatenate(real + [returns[1:] for returns in imagined])
+    low, high = float(np.nanmin(shown)), float(np.nanmax(shown))
+    margin = 0.05 * (high - low)
+    outside = first[(first < low - margin) | (first > high + margin)]
+    if outside.size and margin:
+        axes.set_ylim(low - margin, high + margin)
+        values = ", ".join(f"{value:,.0f}" for value in np.sort(outside))
+        note = f"outside, after the first phase: {values}"
+        axes.text(0.98, 0.04, note, transform=axes.transAxes, ha="right", fontsize=7.5, color=IMAGINED)
 
 
 def _draw_wall_clock(picture: Picture, figure: Figure, curves: list[Curves]) -> None:
