@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from metrpo.callbacks import Callback
     from metrpo.console.progress import SILENT
     from metrpo.evaluation import EvaluationResult, evaluate, render
-    from metrpo.presets import preset
+    from metrpo.presets import override, preset
     from metrpo.run.episodes import append_episode
     from metrpo.run.loaded_policy import LoadedPolicy
     from metrpo.run.metrics import read_metrics
@@ -51,6 +51,7 @@ __all__ = [
     "get_task",
     "init",
     "load_policy",
+    "override",
     "preset",
     "read_metrics",
     "render",
@@ -66,7 +67,7 @@ _HOME = {
     "metrpo.callbacks": ("Callback",),
     "metrpo.console.progress": ("SILENT",),
     "metrpo.evaluation": ("EvaluationResult", "evaluate", "render"),
-    "metrpo.presets": ("preset",),
+    "metrpo.presets": ("override", "preset"),
     "metrpo.run.episodes": ("append_episode",),
     "metrpo.run.loaded_policy": ("LoadedPolicy",),
     "metrpo.run.metrics": ("read_metrics",),

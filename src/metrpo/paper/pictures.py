@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from metrpo.chart_style import COLOURS, GREY, IMAGINED, REAL, png_of, tidy
+from metrpo.chart_style import COLOURS, GREY, IMAGINED, REAL, make_logarithmic, png_of, tidy
 from metrpo.launch.run_spec import RunSpec
 from metrpo.paper.figures import FIGURES, PAPER_REAL_STEPS, PAPER_SECONDS, Figure
 from metrpo.paper.summary import Curves, curves_of, mean_curve
@@ -40,6 +40,8 @@ def draw(name: str, runs: Sequence[RunSpec], out: Path, path: Path) -> bool:
 
 
 def _draw_curves(picture: Picture, figure: Figure, curves: list[Curves]) -> None:
+    from matplotlib.ticker import EngFormatter
+
     tasks = list(dict.fromkeys(c.task for c in curves))
     columns = min(len(tasks), _COLUMNS)
     picture.set_size_inches(max(3.8 * columns, 5.2), 0.5 + 3.2 * -(-len(tasks) // _COLUMNS))
@@ -51,7 +53,7 @@ def _draw_curves(picture: Picture, figure: Figure, curves: list[Curves]) -> None
         axes.set_xlabel("real steps" if figure.log_steps else "real steps (thousands)")
         axes.set_ylabel("return")
         if figure.log_steps:
-            _logarithmic(axes)
+            make_logarithmic(axes.xaxis, EngFormatter(sep=""))
     handles: dict[str, Any] = {}
     for axes in picture.axes:
         lines, names = axes.get_legend_handles_labels()
@@ -146,14 +148,3 @@ def _panels(picture: Picture, count: int) -> list[Axes]:
     for axes in panels[count:]:
         axes.set_axis_off()
     return panels[:count]
-
-
-def _logarithmic(axes: Axes) -> None:
-    """Real steps by powers of ten, with few enough labels for a panel of less than one."""
-    from matplotlib.ticker import EngFormatter, LogLocator
-
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.xaxis.set_minor_locator(LogLocator(subs="all"))
-    axes.xaxis.set_minor_formatter("")

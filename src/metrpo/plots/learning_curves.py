@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from metrpo.chart_style import COLOURS, png_of, tidy
+from metrpo.chart_style import COLOURS, make_logarithmic, png_of, tidy
 from metrpo.counting import counted
 from metrpo.errors import ConfigError
 from metrpo.plots.bands import RATIOS, curve, is_far
@@ -123,15 +123,14 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         if x == "iteration":
             axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        if log_y:
-            _logarithmic(axes)
-        if log:
-            axes.set_xscale("log")
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         if look.x_limits is not None:
             axes.set_xlim(*look.x_limits)
         if look.y_limits is not None:
             axes.set_ylim(*look.y_limits)
+        if log_y:
+            make_logarithmic(axes.yaxis)
+        if log:
+            make_logarithmic(axes.xaxis, EngFormatter(sep=""))
         _add_legend(axes, look.legend, figure.bbox.width / columns)
     if look.title is not None:
         figure.suptitle(look.title, fontsize=13, parse_math=False)
@@ -163,16 +162,6 @@ def _add_legend(axes: Axes, where: Legend, room: float) -> None:
             text.set_parse_math(False)
         if legend.get_window_extent().width <= room:
             return
-
-
-def _logarithmic(axes: Axes) -> None:
-    """Makes y logarithmic, with plain numbers at 1, 2 and 5."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-
-    axes.set_yscale("log")
-    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.yaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def _require_column(runs: Sequence[SeenRun], option: str, name: str) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from metrpo.chart_style import BLUE, GREEN, ORANGE, RED, png_of, tidy
+from metrpo.chart_style import BLUE, GREEN, ORANGE, RED, make_logarithmic, png_of, tidy
 from metrpo.counting import counted
 from metrpo.run.files import atomic_write
 from metrpo.tune.results import Record, Tuned
@@ -66,8 +66,6 @@ def _draw_trials(axes: Axes, worth: Sequence[Record], tuned: Tuned) -> None:
 
 
 def _draw_setting(axes: Axes, worth: Sequence[Record], tuned: Tuned, name: str) -> None:
-    from matplotlib.ticker import LogLocator
-
     span = tuned.search.space[name]
     _points(axes, worth, [_place(span, r.settings[name], r.number) for r in worth], tuned.best)
     axes.set_xlabel(name)
@@ -75,11 +73,8 @@ def _draw_setting(axes: Axes, worth: Sequence[Record], tuned: Tuned, name: str) 
         axes.set_xticks(range(len(span.values)), [str(span.label(value)) for value in span.values], parse_math=False)
         axes.set_xlim(-0.5, len(span.values) - 0.5)
     elif span.log:
-        axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_formatter("")
         axes.set_xlim(span.low / 1.2, span.high * 1.2)
+        make_logarithmic(axes.xaxis)
 
 
 def _place(span: Span, value: Any, number: int) -> float:
