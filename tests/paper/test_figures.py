@@ -387,10 +387,21 @@ def test_publishing_names_what_is_missing_and_shows_every_seed(tmp_path):
     table = (tmp_path / "figures" / "sampling.md").read_text()
     assert "| Swimmer | step_rand | 2,000 | 2.5 (2.0, 3.0) |" in table
     text = "\n".join(told)
-    assert "Swimmer/me-trpo/seed-1: not begun" in text
+    assert "not begun: Swimmer/me-trpo/seed-1\n" in text
     assert "Swimmer/me-trpo/seed-2: not finished, 2,000 real steps so far" in text
     was = a.config.trpo.max_kl
-    assert f"Swimmer/me-trpo/seed-0: made with other settings: trpo.max_kl {was} (today 0.5)" in text
+    assert f"made with other settings: Swimmer/me-trpo/seed-0: trpo.max_kl {was} (today 0.5)" in text
+
+
+def test_runs_that_miss_the_same_are_told_of_together(tmp_path):
+    there, told = runs("k-1", 3), []
+    for run in there:
+        write(tmp_path, run, [1, 2, 3])
+    asked = [dataclasses.replace(run, overrides=(*run.overrides, ("trpo.max_kl", 0.5))) for run in there]
+    publish(["optimizers"], "laptop", (), [*asked, *runs("bptt", 9)], tmp_path, told.append)
+    name, now = "Swimmer/k-1/seed-", f"trpo.max_kl {there[0].config.trpo.max_kl} (today 0.5)"
+    assert f"made with other settings: {name}0, {name}1, {name}2: {now}" in told
+    assert "not begun: Swimmer/bptt/seed-0, Swimmer/bptt/seed-1, Swimmer/bptt/seed-2, 6 more" in told
 
 
 @pytest.mark.slow

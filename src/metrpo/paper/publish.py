@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,9 @@ from metrpo.paper.figures import FIGURES, runs_there
 from metrpo.paper.pictures import draw
 from metrpo.paper.summary import as_markdown, summarise
 from metrpo.run.files import atomic_write
+
+_SHOWN = 4
+"""Names of runs in a line."""
 
 
 def publish(
@@ -32,8 +36,7 @@ def publish(
     `RunDirectoryError` when a file cannot be written.
     """
     shown = {name: runs_there(name, scale, tasks, out) for name in names}
-    for run in dict.fromkeys([*asked, *(run for runs in shown.values() for run in runs)]):
-        _tell_about(run, out, tell)
+    _tell_about(dict.fromkeys([*asked, *(run for runs in shown.values() for run in runs)]), out, tell)
     numbers: dict[str, list[dict[str, Any]]] = {}
     for name, runs in shown.items():
         path = out / "figures" / f"{name}.png"
@@ -50,12 +53,24 @@ def publish(
     return numbers
 
 
-def _tell_about(run: RunSpec, out: Path, tell: Callable[[str], None]) -> None:
-    if not rows_of(run, out):
-        tell(f"{run.name}: not begun")
-        return
-    if not is_finished(run, out):
-        tell(f"{run.name}: not finished, {counted(int(rows_of(run, out)[-1]['real_steps'] or 0), 'real step')} so far")
-    if other := differences(run, out):
-        told = ", ".join(f"{name} {was} (today {now})" for name, (was, now) in other.items())
-        tell(f"{run.name}: made with other settings: {told}")
+def _tell_about(runs: Iterable[RunSpec], out: Path, tell: Callable[[str], None]) -> None:
+    """What is missing, and what was made with other settings than today's: runs of a kind together."""
+    not_begun, otherwise = list[RunSpec](), defaultdict[str, list[RunSpec]](list)
+    for run in runs:
+        if not (rows := rows_of(run, out)):
+            not_begun.append(run)
+        elif not is_finished(run, out):
+            tell(f"{run.name}: not finished, {counted(int(rows[-1]['real_steps'] or 0), 'real step')} so far")
+        if other := differences(run, out):
+            otherwise[", ".join(f"{name} {was} (today {now})" for name, (was, now) in other.items())].append(run)
+    if not_begun:
+        tell(f"not begun: {_names(not_begun)}")
+    for told, those in otherwise.items():
+        tell(f"made with other settings: {_names(those)}: {told}")
+
+
+def _names(runs: Sequence[RunSpec]) -> str:
+    """The first few, and how many more there are."""
+    shown = runs if len(runs) <= _SHOWN else runs[: _SHOWN - 1]
+    more = [f"{len(runs) - len(shown)} more"] if len(shown) < len(runs) else []
+    return ", ".join([*(run.name for run in shown), *more])
