@@ -96,11 +96,15 @@ def test_the_table_is_written_in_every_format(ending, folder, tmp_path, capsys):
     if ending == "csv":
         lines = list(csv.DictReader(io.StringIO(text)))
         assert [line["last return"] for line in lines if line["system"] == "trpo"] == ["4.0"]
-        assert [line["steps to it"] for line in lines if line["task"] == "Swimmer"] == ["175", "-"]
+        assert [float(line["most real steps"]) for line in lines if line["system"] == "trpo"] == [300]
+        assert [line["steps to it"] for line in lines if line["task"] == "Swimmer"] == ["175.0", ""]
+        for line in lines:
+            words = {"task", "system", "against"}
+            assert all(not value or np.isfinite(float(value)) for name, value in line.items() if name not in words)
         columns = ("worst seed", "best", "doing nothing", "random actions")
         assert [[line[c] for c in columns] for line in lines if line["task"] == "Swimmer"] == [
             ["20.0", "30.0", "-1.5", "-10.0"],
-            ["2.0", "6.0", "-", "-"],
+            ["2.0", "6.0", "", ""],
         ]
     if ending == "html":
         assert "95 % bootstrap" in Page(f"<html>{text}</html>").text
@@ -170,6 +174,23 @@ def test_legends_side_by_side_do_not_meet(tmp_path, monkeypatch):
     widths = [axes.get_legend().get_window_extent().width for axes in seen[0].axes]
     assert len(widths) == 3
     assert max(widths) <= seen[0].bbox.width / 3
+
+
+def test_what_has_been_measured_once_is_a_dot(tmp_path, monkeypatch):
+    seen = []
+    monkeypatch.setattr(learning_curves, "png_of", lambda figure: seen.append(figure) or b"x")
+    for seed in (0, 1):
+        a_run(tmp_path / "a" / f"seed-{seed}", Config("Swimmer", seed=seed), rows([1.0 + seed]))
+    plot(find([tmp_path]).runs, tmp_path / "b.png")
+    lines = seen[0].axes[0].get_lines()
+    assert [len(line.get_xdata()) == 1 or line.get_marker() == "o" for line in lines] == [True] * 3
+    assert all(line.get_marker() not in ("", "None") for line in lines)
+
+
+def test_a_logarithmic_axis_without_anything_above_0_is_refused(tmp_path):
+    a_run(tmp_path / "a", rows=rows([-1.0, -2.0]))
+    with pytest.raises(ConfigError, match="y_scale: expected some return_real above 0 on a logarithmic axis, got none"):
+        plot(find([tmp_path]).runs, tmp_path / "b.png", look=Look(y_scale="log"))
 
 
 def test_looks_that_cannot_be_are_refused():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import probe
-from exported import act_and_reset
+from exported import act_and_reset, module_of
 from helpers import linear_ensemble, random_policy
 from metrpo import evaluate, training
 from metrpo.config import Config
@@ -128,6 +128,52 @@ def test_noise_of_ones_own_is_held_too(tmp_path):
     assert (policy.info.max_action, policy.info.max_change) == (0.6, 0.25)
 
 
+@pytest.mark.parametrize("ending", [".npz", ".py"])
+@pytest.mark.parametrize("history", [1, 2])
+def test_what_a_caller_writes_into_an_action_is_not_the_last_one(ending, history, tmp_path):
+    """Scaled to a motor in place, or with noise added: ordinary code."""
+    settings = Config("Probe", max_action=0.6, max_change=0.25, history=history)
+    policy = random_policy(0, 3 * history - 1, 1, scale=9.0)
+    save_policy(tmp_path, policy, "Probe", Learned(1, 20, None), settings=settings)
+    path = export(tmp_path, tmp_path / f"held{ending}")
+    act, reset = act_and_reset(path)
+    observations = np.random.default_rng(1).normal(size=(20, 2)).astype(np.float32)
+    expected = [act(observation).copy() for observation in observations]
+    reset()
+    found = []
+    for observation in observations:
+        action = act(observation)
+        found.append(action.copy())
+        action *= 99
+    np.testing.assert_array_equal(found, expected)
+    assert are_within(np.array(found))
+
+
+def test_a_last_action_beyond_the_range_does_not_lead_beyond_it():
+    """As a log of another controller may hold one."""
+    np.testing.assert_array_equal(BOTH.within(np.array([0.9]), np.array([5.0])), [0.6])
+
+
+@pytest.mark.parametrize("ending", [".npz", ".py"])
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        ([np.nan, 0.0], r"action: expected finite numbers, got nan at \[0\]"),
+        ([[0.0, 0.0], [0.0, np.inf]], r"action: expected finite numbers, got inf at \[1, 1\]"),
+        ([0.0], r"action: expected shape \[2\] or \[B, 2\], got \[1\]"),
+        (0.3, r"action: expected shape \[2\] or \[B, 2\], got \[\]"),
+    ],
+)
+def test_an_action_that_is_none_is_refused_and_not_remembered(ending, action, message, tmp_path):
+    a_run(tmp_path)
+    path = export(tmp_path, tmp_path / f"held{ending}")
+    module = load_policy(path) if ending == ".npz" else module_of(path)
+    before = module.limited(np.array([0.2, 0.2]))
+    with pytest.raises(ValueError, match=message):
+        module.limited(action)
+    np.testing.assert_allclose(module.limited(np.array([9.0, 9.0])), before + 0.25, atol=1e-6)
+
+
 def test_without_limits_a_policy_keeps_nothing(tmp_path):
     a_run(tmp_path, Limits())
     policy, rng = load_policy(tmp_path), np.random.default_rng(0)
@@ -166,7 +212,7 @@ def test_limits_that_cannot_be_are_refused(name, value, tmp_path):
 # ---------------------------------------------------------------- the robot's loop
 
 
-def test_the_robots_loop_counts_the_deadlines_it_misses(tmp_path, monkeypatch):
+def test_the_robots_loop_counts_the_deadlines_it_misses(tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(ROOT / "examples" / "robot"))
     fixed_rate, robot = importlib.import_module("fixed_rate"), importlib.import_module("robot")
     shows = importlib.import_module("arm").shows
@@ -182,6 +228,11 @@ def test_the_robots_loop_counts_the_deadlines_it_misses(tmp_path, monkeypatch):
     monkeypatch.setattr(arm, "move", move)
     done = fixed_rate.control(policy, arm, 20, 12, clock=lambda: now[0], sleep=lambda s: now.__setitem__(0, now[0] + s))
     assert (done.steps, done.missed, done.total) == (12, 2, 12.0)
+    for wrong, said in ((["--hz", "0"], "--hz: expected a number above 0, got 0"), ([], "holds no policy")):
+        monkeypatch.setattr("sys.argv", ["fixed_rate.py", str(tmp_path if wrong else tmp_path / "none"), *wrong])
+        with pytest.raises(SystemExit, match="2"):
+            fixed_rate.main()
+        assert said in capsys.readouterr().err
     assert done.slowest == pytest.approx(0.26)
     torques = np.array([[torque] for _, torque in moved])
     assert are_within(torques / 4)

@@ -55,7 +55,13 @@ def main():
     arguments.add_argument("--hz", type=float, default=1 / DT)
     arguments.add_argument("--steps", type=int, default=60)
     given = arguments.parse_args()
-    done = control(metrpo.load_policy(given.run_dir), Arm(np.random.default_rng(0)), given.hz, given.steps)
+    if given.hz <= 0:
+        arguments.error(f"--hz: expected a number above 0, got {given.hz:g}")
+    try:
+        policy = metrpo.load_policy(given.run_dir)
+    except metrpo.MetrpoError as error:
+        arguments.error(str(error))
+    done = control(policy, Arm(np.random.default_rng(0)), given.hz, given.steps)
     rate = f"{done.steps} steps at {given.hz:g} Hz: {done.missed} deadlines missed"
     print(f"{rate}, slowest step {1000 * done.slowest:.2f} ms; return {done.total:.1f}")
 

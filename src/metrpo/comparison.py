@@ -188,6 +188,24 @@ def cells(one: Compared) -> tuple[str, ...]:
     )
 
 
+NUMBERS = (
+    *("task", "system", "seeds", "fewest real steps", "most real steps", "last return", "last return, low"),
+    *("last return, high", "worst seed", "best", *NAMES.values(), "level", "steps to it", "seeds that reach it"),
+    *("better", "better, low", "better, high", "against"),
+)
+
+
+def numbers(one: Compared) -> tuple[str, ...]:
+    """A row of the table for programs, under `NUMBERS`: every number whole and alone, an empty cell where none is."""
+    better = (None,) * 3 if one.better is None else (one.better.value, one.better.low, one.better.high)
+    values = (
+        *(one.task, one.label, one.seeds, *one.real_steps, one.last.value, one.last.low, one.last.high),
+        *(one.worst, one.best, *(one.no_skill.get(name) for name in NAMES.values()), one.level, one.steps),
+        *(one.reached, *better, one.against),
+    )
+    return tuple("" if value is None else str(value) for value in values)
+
+
 def _return(value: float) -> str:
     return f"{value:.1f}" if abs(value) < 1e9 else f"{value:.2g}"
 

@@ -127,10 +127,13 @@ def _task_of(place: str | Path, made: PolicyInfo) -> Task:
 
 
 def _task_at(task: str, made: PolicyInfo | None) -> Task:
-    """The task of that name, with the policy's arguments where it may be the policy's own task, moved."""
+    """The task of that name, with the policy's arguments where it may be the policy's own task, moved.
+
+    Its imports are for the task's old name: a new one brings its own module.
+    """
     if made is None or (":" not in task and task != made.task):
         return get_task(task)
-    return get_task(task, made.env_kwargs, made.imports)
+    return get_task(task, made.env_kwargs, made.imports if task == made.task else ())
 
 
 def _require_seed(seed: int) -> None:

@@ -38,11 +38,10 @@ class Limits:
     def within(self, actions: Array, before: Array | None = None) -> Array:
         """The actions [..., A] within the limits, given the executed ones `before` them, [..., A]; None: 0."""
         xp = actions.__array_namespace__()
-        limited = xp.clip(actions, -self.max_action, self.max_action)
-        if self.max_change is None:
-            return limited
-        before = xp.zeros_like(limited) if before is None else before
-        return xp.clip(limited, before - self.max_change, before + self.max_change)
+        if self.max_change is not None:
+            before = xp.zeros_like(actions) if before is None else before
+            actions = xp.clip(actions, before - self.max_change, before + self.max_change)
+        return xp.clip(actions, -self.max_action, self.max_action)
 
 
 NONE = Limits()

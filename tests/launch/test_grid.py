@@ -149,6 +149,8 @@ def test_systems_may_have_budgets_of_their_own(tmp_path):
 def test_a_file_stands_alone():
     with pytest.raises(ConfigError, match=r"seeds: expected it in grid\.toml alone"):
         parse.parse(["sweep", "grid.toml", "--seeds", "3"])
+    with pytest.raises(ConfigError, match=r"seeds: expected it in grid\.toml alone"):
+        parse.parse(["sweep", "grid.toml", "--seeds=0:3"])  # its default: asked for all the same
     assert parse.parse(["sweep", "grid.toml", "--jobs", "3", "--out", "a", "--dry-run"]).dry_run
 
 

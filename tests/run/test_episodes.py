@@ -144,13 +144,14 @@ GOOD = {"states": np.zeros((4, 4)), "actions": np.zeros((3, 2)), "rewards": np.z
         ({"actions": np.full((3, 2), 1.5)}, r"actions: expected numbers in \[-1, 1\], got 1\.5"),
         ({"rewards": np.zeros((3, 1))}, r"rewards: expected \[3\], got shape \[3, 1\]"),
         ({"rewards": [0.0, np.nan, 0.0]}, "rewards: expected finite numbers"),
+        ({"terminated": np.zeros(3, bool)}, "terminated: expected one truth value, got 3 of them"),
         ({"states": np.full((4, 4), np.inf)}, "states: expected finite numbers"),
         ({"states": np.zeros((1, 4)), "actions": np.zeros((0, 2)), "rewards": []}, "expected at least one step"),
     ],
 )
 def test_what_cannot_be_learned_from_is_refused(run_dir, wrong, message):
     with pytest.raises(TaskError, match=message):
-        append_episode(run_dir, **{**GOOD, **wrong}, terminated=False)
+        append_episode(run_dir, **{"terminated": False, **GOOD, **wrong})
     assert EpisodeLog(run_dir).pending() == []
     append_episode(run_dir, **GOOD, terminated=True)
     assert EpisodeLog(run_dir).pending()[0].terminated is True

@@ -88,6 +88,19 @@ def test_what_a_run_lacks_the_card_says(tmp_path):
     assert "curve.png" not in body
 
 
+def test_what_a_policy_remembers_its_card_says(tmp_path):
+    config = dataclasses.replace(CONFIG, task="mine.py:arm", history=2, max_action=0.5, max_change=0.2)
+    made = parcel(a_finished_run(tmp_path / "run", config), "me/arm")
+    assert (
+        "\nIts actions stay within 0.5 of 0, each within 0.2 of the one before. It sees the last 2 "
+        "observations and the actions between them. Call it once a step, and `policy.reset()` before each episode.\n"
+    ) in made.card
+    assert "`metrpo evaluate hub:me/arm --task PATH/mine.py:arm` plays it." in made.card
+    plain = parcel(a_finished_run(tmp_path / "plain", CONFIG), "me/swim").card
+    assert "policy.reset" not in plain
+    assert "`metrpo evaluate hub:me/swim` plays it." in plain
+
+
 def test_any_name_of_a_task_is_a_text_of_the_card(tmp_path):
     evil = '/home/me/secret/mine.py:a"b: [\n---\nx`!'
     made = parcel(a_finished_run(tmp_path / "run", dataclasses.replace(CONFIG, task=evil)), None)

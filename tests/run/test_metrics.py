@@ -24,6 +24,7 @@ def test_rows_come_back_exactly(tmp_path, values):
     rows = [{"a": a, "b,\n": b} for a, b in values]
     (tmp_path / "metrics.csv").write_bytes(to_csv(rows).encode())
     back = read_metrics(tmp_path / "metrics.csv")
+    assert repr(read_metrics(tmp_path)) == repr(back), "a run directory will do"
     assert [[repr(v) for v in row.values()] for row in back] == [[repr(v) for v in row.values()] for row in rows]
     assert list(back[0]) == ["a", "b,\n"]
 

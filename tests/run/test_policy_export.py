@@ -191,12 +191,14 @@ def test_a_directory_in_the_way_is_named(tmp_path):
         ("my-policy", "my_policy"),
         ("class", "class_policy"),
         ("numpy", "numpy_policy"),
+        ("types", "types_policy"),
         ("007", "my_policy"),
     ],
 )
 def test_an_unimportable_name_is_refused_with_a_better_one(name, better, tmp_path):
     saved(tmp_path)
-    with pytest.raises(MetrpoError, match=rf"can import, such as {better}\.py, got {name}\.py"):
+    expected = "(a name that Python can import|no module of Python or NumPy)"
+    with pytest.raises(MetrpoError, match=rf"expected {expected}, such as {better}\.py, got {name}\.py"):
         export(tmp_path, tmp_path / f"{name}.py")
     assert not (tmp_path / f"{name}.py").exists()
     assert export(tmp_path, tmp_path / f"{name}.npz").exists(), "only Python imports"

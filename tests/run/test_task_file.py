@@ -330,6 +330,23 @@ def test_an_imported_id_with_arguments_is_rebuilt_from_anywhere(tmp_path, tilted
         get_task("Tilted-v0", {"mode": "odd"})
 
 
+def test_an_imported_id_whose_module_moved_is_found_by_its_new_place(tmp_path, tilted, monkeypatch, capsys):
+    config = parse(["train", "Tilted-v0", "--import", "tilting", "--env-kwargs", "g=2.5"]).config
+    a_run(tmp_path / "run", config.task, env_kwargs=config.env_kwargs, imports=config.imports)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").rename(tmp_path / "moved")
+    forgotten(monkeypatch, "tilting")
+    gymnasium.registry.pop("Tilted-v0")
+    code, said = evaluated(capsys, "run")
+    assert code == 2
+    assert "give its new place: --task path/to/file.py:name" in said
+    made = []
+    monkeypatch.setattr("metrpo.evaluation.batch_episodes.evaluate", lambda task, *_: made.append(task) or np.zeros(1))
+    place = "moved/tilting.py:Tilted-v0"
+    assert evaluated(capsys, "run", "--task", place) == (0, place)
+    assert gravity(made[0]) == 2.5
+
+
 def test_a_file_that_moved_keeps_its_arguments(tmp_path, tilted, monkeypatch, capsys):
     assert get_task("tilting.py:tilted", {"horizon": 7}).horizon == 7
     a_run(tmp_path / "run", "tilting.py:tilted", env_kwargs=("g=3.5",))

@@ -84,6 +84,10 @@ def test_wandb_logs_offline_into_the_run_directory(run_dir, monkeypatch):
     assert files
     written = b"".join(path.read_bytes() for folder in files for path in folder.glob("*.wandb"))
     assert b"return_real" in written
+    monkeypatch.setenv("WANDB_DIR", str(run_dir / "elsewhere"))
+    (run_dir / "elsewhere").mkdir()
+    track("wandb", run_dir, 3, 4)
+    assert list((run_dir / "elsewhere" / "wandb").glob("offline-run-*"))
     wandb.teardown()
 
 

@@ -71,6 +71,13 @@ def test_actions_are_rescaled_to_the_environments_own_range():
     assert guard.action_space == Box(-1, 1, (2,), np.float32)
 
 
+def test_a_new_environments_first_step_is_the_middle_of_the_range():
+    """Whatever limits its actions are to have: no jolt before they are known."""
+    env = Env()
+    task_of(lambda render_mode=None: env, horizon=5)
+    np.testing.assert_allclose(env.given, [[1, 0.5]])
+
+
 def test_dicts_and_tuples_are_flattened():
     inner = {"angle": Box(-1, 1, (2, 2), np.float64), "rest": Tuple((Box(0, 1, (1,)), Box(0, 1, ())))}
 

@@ -42,7 +42,7 @@ class Compare:
 
 def run(command: Compare) -> int:
     """Returns the exit code."""
-    from metrpo.comparison import HEADER, cells, compare, notes
+    from metrpo.comparison import HEADER, NUMBERS, cells, compare, notes, numbers
     from metrpo.report.tables import markdown, written
     from metrpo.run.files import atomic_write
     from metrpo.run.find import find
@@ -53,7 +53,9 @@ def run(command: Compare) -> int:
     compared = compare(found.runs, levels, command.against)
     table = (HEADER, [cells(one) for one in compared], notes(compared))
     if command.out is not None:
-        atomic_write(command.out, written(command.out.suffix.removeprefix(".").lower(), *table))
+        kind = command.out.suffix.removeprefix(".").lower()
+        shown = (NUMBERS, [numbers(one) for one in compared], []) if kind == "csv" else table
+        atomic_write(command.out, written(kind, *shown))
     if command.json:
         print(json.dumps([one.plain() for one in compared], indent=1))
     else:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -112,10 +113,14 @@ def require_at_least_one(name: str, count: int | None) -> None:
         raise ConfigError(f"{name}: expected at least 1, got {count}")
 
 
-def require_file_alone(command: object, spec: Path | None, apart: tuple[str, ...]) -> None:
-    """Raises `ConfigError` when options other than `apart` are given together with the file `spec`."""
-    if spec is None:
+def require_file_alone(command: object, asked: Collection[str]) -> None:
+    """Raises `ConfigError` when options that a command's file `spec` holds are `asked` for as well.
+
+    Such a command names the options that its file does not hold in `APART`.
+    """
+    apart, spec = getattr(command, "APART", None), getattr(command, "spec", None)
+    if apart is None or spec is None:
         return
-    fields = [f for f in dataclasses.fields(command) if f.name not in apart]  # type: ignore[arg-type]
-    if twice := [f.name for f in fields if getattr(command, f.name) != f.default]:
+    held = [f.name for f in dataclasses.fields(command) if f.name not in apart]  # type: ignore[arg-type]
+    if twice := [name for name in held if name in asked]:
         raise ConfigError(f"{twice[0]}: expected it in {spec} alone, got it as an option; write it there")

@@ -11,7 +11,7 @@ from tyro.conf import OmitSubcommandPrefixes
 
 from metrpo.commands.command_table import NAMES, options_class
 from metrpo.commands.help import overview, shown
-from metrpo.commands.options import FEW, RunOptions
+from metrpo.commands.options import FEW, RunOptions, require_file_alone
 from metrpo.commands.words import command_of, joined, lists_of, understood
 from metrpo.config import Config
 from metrpo.errors import MetrpoError
@@ -34,7 +34,9 @@ def parse(arguments: list[str]) -> Any:
     if issubclass(kind, RunOptions):
         return _parse_run(kind, [a for a in arguments if a not in _HELP], asked)
     if asked is None:
-        return understood(lambda: _tyro(kind, None, arguments), kind, arguments)
+        parsed = understood(lambda: _tyro(kind, None, arguments), kind, arguments)
+        require_file_alone(parsed, _asked(arguments))
+        return parsed
     _show(kind, None, arguments[0])
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from metrpo.commands.attend import attended_runs
-from metrpo.commands.options import Switch, require_file_alone
+from metrpo.commands.options import Switch
 from metrpo.commands.output import exit_code, printer
 from metrpo.config import Preset, System
 from metrpo.counting import counted
@@ -64,9 +64,8 @@ class Sweep:
     dry_run: Switch = False
     """Only list the runs."""
     means: Annotated[Means, OmitArgPrefixes] = field(default_factory=Means)
-
-    def __post_init__(self) -> None:
-        require_file_alone(self, self.spec, apart=("spec", "out", "dry_run", "means"))
+    APART: ClassVar[tuple[str, ...]] = ("spec", "out", "dry_run", "means")
+    """Not in the file."""
 
 
 def run(command: Sweep) -> int:

@@ -6,12 +6,12 @@ import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
 
 from tyro.conf import Positional, arg
 
 from metrpo.commands.attend import attended_runs
-from metrpo.commands.options import Switch, require_at_least_one, require_file_alone
+from metrpo.commands.options import Switch, require_at_least_one
 from metrpo.commands.output import exit_code, printer
 from metrpo.config import Preset, System
 from metrpo.errors import ConfigError
@@ -72,10 +72,11 @@ class Tune:
     """Print all trials and the best one as JSON."""
     dry_run: Switch = False
     """Only print the search."""
+    APART: ClassVar[tuple[str, ...]] = ("spec", "jobs", "out", "json", "dry_run")
+    """Not in the file."""
 
     def __post_init__(self) -> None:
         require_at_least_one("jobs", self.jobs)
-        require_file_alone(self, self.spec, apart=("spec", "jobs", "out", "json", "dry_run"))
 
 
 def run(command: Tune) -> int:

@@ -94,6 +94,9 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
     log_y = look.y_scale == "log"
     if look.y_scale == "auto" and y.startswith(RATIOS):
         log_y = all((seed[1] > 0).all() for g in groups for seed in curve(g, x, y).seeds)
+    for name, values, scale in (("x", x, look.x_scale), ("y", y, look.y_scale)):
+        if scale == "log" and not any(_has_positive(run, values) for run in runs):
+            raise ConfigError(f"{name}_scale: expected some {values} above 0 on a logarithmic axis, got none")
     if not groups:
         raise ConfigError(f"y: expected a column that some run has together with {x}, got {y}; choose another --x")
     tasks = list(dict.fromkeys(g.task for g in groups))
@@ -110,10 +113,11 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
             style = {"color": COLOURS[i % len(COLOURS)], "linestyle": ("-", "--", ":")[i // len(COLOURS) % 3]}
             if len(c.seeds) > 1:
                 for seed in c.seeds:
-                    axes.plot(*seed, **style, linewidth=0.7, alpha=0.4)
+                    axes.plot(*seed, **style, linewidth=0.7, alpha=0.4, marker="." if len(seed[0]) == 1 else "")
                 axes.fill_between(c.x, c.low, c.high, color=style["color"], alpha=0.15, linewidth=0)
             name = f"{g.label} ({counted(len(c.seeds), 'seed')})" if len(c.seeds) > 1 else g.label
-            marker = "o" if len(c.seeds) == 1 and len(c.x) <= _DOTS else ""
+            few = len(c.seeds) == 1 and len(c.x) <= _DOTS
+            marker = "o" if few or (len(c.x) and c.x[0] == c.x[-1]) else ""  # a point has no line
             label = textwrap.fill(name, _LETTERS, break_on_hyphens=False)
             axes.plot(c.x, c.mean, **style, linewidth=2, marker=marker, markersize=3.5, label=label)
         axes.set_title(task, fontsize=11, parse_math=False)
@@ -162,6 +166,10 @@ def _add_legend(axes: Axes, where: Legend, room: float) -> None:
             text.set_parse_math(False)
         if legend.get_window_extent().width <= room:
             return
+
+
+def _has_positive(run: SeenRun, name: str) -> bool:
+    return bool((run.column(name) > 0).any())
 
 
 def _require_column(runs: Sequence[SeenRun], option: str, name: str) -> None:

@@ -102,9 +102,30 @@ def _body(run: SeenRun, card: dict[str, Any], task: str, earned: str, repo: str,
         "```",
         "",
         "`policy(observation)` is the action in [-1, 1], `policy.to_env(action)` the same in the environment's units.",
-        f"`metrpo evaluate hub:{repo}` plays it. `policy.py` is the same policy for machines that have NumPy alone.",
+        *_what_it_remembers(run),
+        f"`metrpo evaluate hub:{repo}{_asks_for_task(task)}` plays it.",
+        "`policy.py` is the same policy for machines that have NumPy alone.",
         *(["", "![Learning curve](curve.png)"] if "curve.png" in files else []),
     ]
+
+
+def _what_it_remembers(run: SeenRun) -> list[str]:
+    """That it remembers something within an episode, and its limits."""
+    info = load_policy(run.path).info
+    said = []
+    if info.max_action < 1 or info.max_change is not None:
+        change = "" if info.max_change is None else f", each within {info.max_change:g} of the one before"
+        said.append(f"Its actions stay within {info.max_action:g} of 0{change}.")
+    if info.history > 1:
+        said.append(f"It sees the last {info.history} observations and the actions between them.")
+    if info.history > 1 or info.max_change is not None:
+        said.append("Call it once a step, and `policy.reset()` before each episode.")
+    return [" ".join(said)] if said else []
+
+
+def _asks_for_task(task: str) -> str:
+    """A task of its author's own has to be named: no downloaded name runs code."""
+    return f" --task PATH/{task}" if ".py:" in task else f" --task {task}" if ":" in task else ""
 
 
 def _earned(run: SeenRun, card: dict[str, Any]) -> str:

@@ -236,6 +236,8 @@ def append_episode(
             raise TaskError(f"append_episode: {name}: expected {expected}, got shape {list(array.shape)}")
         if not _finite(array):
             raise TaskError(f"append_episode: {name}: expected finite numbers; cut the episode before the others")
+    if np.ndim(terminated) != 0:
+        raise TaskError(f"append_episode: terminated: expected one truth value, got {np.size(terminated)} of them")
     beyond = float(np.abs(arrays["actions"]).max())
     if beyond > 1 + 1e-6:
         raise TaskError(f"append_episode: actions: expected numbers in [-1, 1], got {beyond:.4g}; divide by the range")

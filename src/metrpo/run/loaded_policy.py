@@ -86,17 +86,18 @@ class LoadedPolicy:
     def limited(self, action: Any) -> np.ndarray:
         """An action [A] or [B, A] of your own (`unlimited` plus noise, say), cut to the policy's limits.
 
-        Remembers it as the last one, also for a history. Raises `ValueError` when its shape is not the last one's.
+        Remembers it as the last one, also for a history. Raises `ValueError` when its shape is another one or not the
+        last one's, and when it is not finite.
         """
-        wanted, before = np.asarray(action, np.float32), self._last.get("action")
+        wanted, before = _finite_actions(action, self.info.action_size, np.float32), self._last.get("action")
         if before is not None and before.shape != wanted.shape:
             expected, got = list(before.shape), list(wanted.shape)
             raise ValueError(f"action: expected shape {expected} as in the step before, got {got}; call reset() first")
         limited = Limits.of(self.info).within(wanted, before).astype(np.float32)
         if self.info.max_change is not None:
-            self._last["action"] = limited
+            self._last["action"] = limited.copy()  # the caller may write into theirs
         if self.info.history > 1:
-            self._last["taken"] = limited
+            self._last["taken"] = limited.copy()
         return limited
 
     def unlimited(self, observation: Any) -> np.ndarray:
@@ -143,9 +144,7 @@ class LoadedPolicy:
         if self.origin is not None:
             with np.errstate(over="ignore"):
                 hidden = (hidden - self.origin).astype(np.float32)
-        if not np.isfinite(hidden).all():
-            at = np.argwhere(~np.isfinite(hidden))[0]
-            raise ValueError(f"observation: expected finite numbers, got {hidden[tuple(at)]} at {at.tolist()}")
+        _require_finite("observation", hidden)
         for weights, bias in self.layers[:-1]:
             hidden = np.tanh(hidden @ weights + bias)
         weights, bias = self.layers[-1]
@@ -154,15 +153,13 @@ class LoadedPolicy:
     def to_env(self, action: Any) -> np.ndarray:
         """An action in [-1, 1] in the environment's own units, within its bounds: [A] -> [A] or [B, A] -> [B, A].
 
-        float32 where that holds the bounds exactly, else float64. Raises `ValueError` for other shapes, and when the
-        policy does not say the bounds, as older ones do not.
+        float32 where that holds the bounds exactly, else float64. Raises `ValueError` for other shapes, for NaN and
+        infinity, and when the policy does not say the bounds, as older ones do not.
         """
         if self.info.action_low is None or self.info.action_high is None:
             raise ValueError(f"the policy for {brief(self.info.task)} does not say its environment's range of actions")
         low, high = np.array(self.info.action_low), np.array(self.info.action_high)
-        part = 0.5 * (np.clip(np.asarray(action, np.float64), -1.0, 1.0) + 1.0)
-        if part.ndim not in (1, 2) or part.shape[-1] != len(low):
-            raise ValueError(f"action: expected shape [{len(low)}] or [B, {len(low)}], got {list(part.shape)}")
+        part = 0.5 * (np.clip(_finite_actions(action, len(low), np.float64), -1.0, 1.0) + 1.0)
         scaled = np.clip((1.0 - part) * low + part * high, low, high)
         exact = np.array_equal(low, np.float32(low)) and np.array_equal(high, np.float32(high))
         return scaled.astype(np.float32 if exact else np.float64)
@@ -172,6 +169,25 @@ def _as_batch(observation: Any, size: int, kind: type) -> np.ndarray:
     """Raises `ValueError` unless it is of shape [size] or [B, size]."""
     with np.errstate(over="ignore"):
         batch: np.ndarray = np.asarray(observation, dtype=kind)
-    if batch.ndim not in (1, 2) or batch.shape[-1] != size:
-        raise ValueError(f"observation: expected shape [{size}] or [B, {size}], got {list(batch.shape)}")
+    _require_shape("observation", batch, size)
     return batch
+
+
+def _finite_actions(action: Any, size: int, kind: type) -> np.ndarray:
+    """Raises `ValueError` unless they are of shape [size] or [B, size], and finite."""
+    with np.errstate(over="ignore"):
+        batch: np.ndarray = np.asarray(action, dtype=kind)
+    _require_shape("action", batch, size)
+    _require_finite("action", batch)
+    return batch
+
+
+def _require_shape(name: str, batch: np.ndarray, size: int) -> None:
+    if batch.ndim not in (1, 2) or batch.shape[-1] != size:
+        raise ValueError(f"{name}: expected shape [{size}] or [B, {size}], got {list(batch.shape)}")
+
+
+def _require_finite(name: str, batch: np.ndarray) -> None:
+    if not np.isfinite(batch).all():
+        at = np.argwhere(~np.isfinite(batch))[0]
+        raise ValueError(f"{name}: expected finite numbers, got {batch[tuple(at)]} at {at.tolist()}")

@@ -86,11 +86,12 @@ def to_csv(rows: Sequence[Row]) -> str:
 
 
 def read_metrics(path: str | Path) -> list[Row]:
-    """The rows of a `metrics.csv`, ints as ints, floats exactly as written.
+    """The rows of a `metrics.csv`, or of that in a run directory, ints as ints, floats exactly as written.
 
     Raises `RunDirectoryError` when it cannot be read, or is no table of numbers.
     """
-    text = text_of(Path(path), RunDirectoryError)
+    path = Path(path)
+    text = text_of(path / "metrics.csv" if path.is_dir() else path, RunDirectoryError)
     try:
         columns, *lines = list(csv.reader(io.StringIO(text, newline=""), strict=True)) or [[]]
         if len(set(columns)) != len(columns):

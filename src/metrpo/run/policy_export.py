@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from keyword import iskeyword
@@ -22,8 +23,8 @@ from metrpo.run.python_template import SOURCE
 from metrpo.safe_load import opened
 
 _Writer = Callable[[LoadedPolicy, Path], bytes | str]
-_IMPORTED = ("base64", "hashlib", "numpy")
-"""By the exported file: one of these names would be that file itself."""
+_TAKEN = sys.stdlib_module_names | {"numpy"}
+"""A file of one of these names would stand in for that module, in what it imports itself and in its neighbours."""
 
 
 def export(run_dir: Path, out: Path | None = None) -> Path:
@@ -55,12 +56,16 @@ def export(run_dir: Path, out: Path | None = None) -> Path:
 
 def _require_importable(out: Path) -> None:
     """Raises `MetrpoError` for a file that no `import` can name, or that stands in the way of what it imports."""
-    name = out.stem
-    if name.isidentifier() and not iskeyword(name) and name not in _IMPORTED:
+    if _is_importable(out.stem):
         return
-    better = re.sub(r"\W+", "_", name).strip("_").lstrip("0123456789_")
-    better = better if better.isidentifier() and better != name else f"{better or 'my'}_policy"
-    raise MetrpoError(f"{out}: expected a name that Python can import, such as {better}.py, got {out.name}")
+    better = re.sub(r"\W+", "_", out.stem).strip("_").lstrip("0123456789_")
+    better = better if _is_importable(better) else f"{better or 'my'}_policy"
+    expected = "no module of Python or NumPy" if out.stem in _TAKEN else "a name that Python can import"
+    raise MetrpoError(f"{out}: expected {expected}, such as {better}.py, got {out.name}")
+
+
+def _is_importable(name: str) -> bool:
+    return name.isidentifier() and not iskeyword(name) and name not in _TAKEN
 
 
 def _completed(policy: LoadedPolicy) -> LoadedPolicy:

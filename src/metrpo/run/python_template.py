@@ -64,17 +64,20 @@ $remember    return limited(np.clip(hidden @ weights + bias, -1.0, 1.0))
 
 
 def limited(action):
-    """An action, such as one of your own, within MAX_ACTION and MAX_CHANGE; it is the last one from then on."""
-    action = np.clip(np.asarray(action, dtype=np.float32), -MAX_ACTION, MAX_ACTION)
-    if MAX_CHANGE is None:
-        if HISTORY > 1:
-            _last["action"] = action
-        return action
-    before = _last.get("action", np.zeros_like(action))
-    if before.shape != action.shape:
-        raise ValueError(f"action: expected shape {list(before.shape)} as in the step before: call reset() first")
-    _last["action"] = np.clip(action, before - MAX_CHANGE, before + MAX_CHANGE).astype(np.float32)
-    return _last["action"]
+    """An action, such as one of your own, within MAX_ACTION and MAX_CHANGE; it is the last one from then on.
+
+    ValueError for other shapes, NaN or infinity.
+    """
+    action = _actions(action, np.float32)
+    if MAX_CHANGE is not None:
+        before = _last.get("action", np.zeros_like(action))
+        if before.shape != action.shape:
+            raise ValueError(f"action: expected shape {list(before.shape)} as in the step before: call reset() first")
+        action = np.clip(action, before - MAX_CHANGE, before + MAX_CHANGE)
+    action = np.clip(action, -MAX_ACTION, MAX_ACTION).astype(np.float32)
+    if MAX_CHANGE is not None or HISTORY > 1:
+        _last["action"] = action.copy()  # the caller may write into theirs
+    return action
 
 
 def to_env(action):
@@ -82,9 +85,7 @@ def to_env(action):
     if ACTION_LOW is None or ACTION_HIGH is None:
         raise ValueError("this policy does not say its environment's range of actions: scale them yourself")
     low, high = np.array(ACTION_LOW, dtype=np.float64), np.array(ACTION_HIGH, dtype=np.float64)
-    part = 0.5 * (np.clip(np.asarray(action, dtype=np.float64), -1.0, 1.0) + 1.0)
-    if part.ndim not in (1, 2) or part.shape[-1] != ACTION_SIZE:
-        raise ValueError(f"action: expected shape [{ACTION_SIZE}] or [B, {ACTION_SIZE}], got {list(part.shape)}")
+    part = 0.5 * (np.clip(_actions(action, np.float64), -1.0, 1.0) + 1.0)
     scaled = np.clip((1.0 - part) * low + part * high, low, high)
     exact = np.array_equal(low, np.float32(low)) and np.array_equal(high, np.float32(high))
     return scaled.astype(np.float32 if exact else np.float64)
@@ -93,6 +94,17 @@ def to_env(action):
 def control(observation):
     """The action in the environment's own units: `to_env(act(observation))`."""
     return to_env(act(observation))
+
+
+def _actions(action, kind):
+    with np.errstate(over="ignore"):
+        action = np.asarray(action, dtype=kind)
+    if action.ndim not in (1, 2) or action.shape[-1] != ACTION_SIZE:
+        raise ValueError(f"action: expected shape [{ACTION_SIZE}] or [B, {ACTION_SIZE}], got {list(action.shape)}")
+    if not np.isfinite(action).all():
+        at = np.argwhere(~np.isfinite(action))[0]
+        raise ValueError(f"action: expected finite numbers, got {action[tuple(at)]} at {at.tolist()}")
+    return action
 
 
 def _layers(text):

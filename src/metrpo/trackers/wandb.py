@@ -1,4 +1,7 @@
-"""Weights & Biases; `WANDB_MODE=offline` keeps all on this machine, `WANDB_PROJECT` names another project."""
+"""Weights & Biases.
+
+`WANDB_MODE=offline` keeps all on this machine, `WANDB_PROJECT` names another project, `WANDB_DIR` another folder.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from metrpo.trackers.common import PROJECT, Tracker
 
 
 class Wandb(Tracker):
-    """A run of Weights & Biases, whose files lie in the run directory."""
+    """A run of Weights & Biases, whose files lie in the run directory, unless `WANDB_DIR` says otherwise."""
 
     name = "wandb"
 
@@ -19,8 +22,8 @@ class Wandb(Tracker):
         import wandb
 
         more: dict[str, Any] = {} if earlier is None else {"id": earlier, "resume": "allow"}
-        project = os.environ.get("WANDB_PROJECT", PROJECT)
-        self._run: Any = wandb.init(project=project, name=title, config=settings, dir=run_dir, **more)
+        project, folder = os.environ.get("WANDB_PROJECT", PROJECT), os.environ.get("WANDB_DIR", run_dir)
+        self._run: Any = wandb.init(project=project, name=title, config=settings, dir=folder, **more)
         return str(self._run.id)
 
     def log(self, numbers: dict[str, float], iteration: int) -> None:

@@ -58,6 +58,8 @@ def get_task(name: str, env_kwargs: Iterable[str] | Mapping[str, Any] = (), impo
     names = list(original)
     near = [original[n] for n in difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.4)]
     hint = f"did you mean {' or '.join(near)}? " if near else ""
+    if name.endswith(".py"):
+        hint = f"which task in that file? {name}:NAME; "
     raise TaskError(
         f"unknown task {name!r}: {hint}known tasks: {', '.join(_TASKS)} (see: metrpo tasks), any Gymnasium id "
         "(--import MODULE registers your own), module:name or path/to/file.py:name"

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import gymnasium
+import numpy as np
 
 from metrpo.config.env_kwargs import keywords
 from metrpo.errors import MissingTaskError, TaskError
@@ -52,7 +53,7 @@ def task_of(
         if with_limit.time_limit is not None:
             require_horizon(called, with_limit.time_limit)
         state, _ = with_limit.reset(seed=0)
-        with_limit.step(with_limit.action_space.sample())
+        with_limit.step(np.zeros(with_limit.action_size, np.float32))  # within any limits on actions
         actions, limit = with_limit.action_size, with_limit.time_limit
         shows = interface.of_env(with_limit._env, called)
     if limit is None:
