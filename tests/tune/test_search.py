@@ -232,8 +232,14 @@ def test_a_wrong_file_is_named(tmp_path, text, message):
     file.write_text(text)
     with pytest.raises(ConfigError, match=message):
         from_file(file)
-    with pytest.raises(ConfigError, match=r"trials: expected it in search\.toml alone"):
-        Tune(spec=Path("search.toml"), trials=3)
+
+
+def test_an_option_beside_a_file_that_holds_it_is_refused():
+    default = next(f.default for f in dataclasses.fields(Tune) if f.name == "trials")
+    for count in ("3", str(default)):
+        with pytest.raises(ConfigError, match=r"trials: expected it in search\.toml alone"):
+            parse.parse(["tune", "search.toml", "--trials", count])
+    assert parse.parse(["tune", "search.toml", "--jobs", "2"]).jobs == 2
 
 
 def test_the_objective_by_hand():
