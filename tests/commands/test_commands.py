@@ -200,6 +200,7 @@ def test_settings_start_from_the_preset_of_the_task():
 
 WRONG = [
     (["train", "Swimer"], "unknown task 'Swimer': did you mean Swimmer"),
+    (["train", "mine.py"], "unknown task 'mine.py': which task in that file? mine.py:NAME; known tasks: Swimmer"),
     (["train", "Swimmer", "--ensemble.members", "0"], "ensemble.members: expected at least 1, got 0"),
     (["train", "Swimmer", "--ensemble.members", "many"], "--ensemble.members: expected a whole number, got many"),
     (["train", "Swimmer", "--trpo.maxkl", "3"], "unknown option --trpo.maxkl, did you mean --trpo.max-kl?"),
