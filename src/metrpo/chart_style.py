@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import io
+import math
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -36,7 +35,7 @@ def make_logarithmic(axis: XAxis | YAxis, formatter: str | Formatter = "{x:g}") 
 
     axis.axes.set(**{f"{axis.axis_name}scale": "log"})
     low, high = axis.get_view_interval()
-    decades = np.log10(high / low)
+    decades = math.log10(high / low)
     axis.set_major_locator(LogLocator(subs=(1, 2, 5) if decades < 2 else (1, 3) if decades < 4 else (1,)))
     axis.set_major_formatter(formatter)
     axis.set_minor_locator(LogLocator(subs="all"))

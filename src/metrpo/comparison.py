@@ -188,22 +188,27 @@ def cells(one: Compared) -> tuple[str, ...]:
     )
 
 
-NUMBERS = (
-    *("task", "system", "seeds", "fewest real steps", "most real steps", "last return", "last return, low"),
-    *("last return, high", "worst seed", "best", *NAMES.values(), "level", "steps to it", "seeds that reach it"),
-    *("better", "better, low", "better, high", "against"),
-)
-
-
-def numbers(one: Compared) -> tuple[str, ...]:
-    """A row of the table for programs, under `NUMBERS`: every number whole and alone, an empty cell where none is."""
+def whole(one: Compared) -> dict[str, str]:
+    """The same for programs, by column: every number whole and alone, and empty where there is none."""
     better = (None,) * 3 if one.better is None else (one.better.value, one.better.low, one.better.high)
-    values = (
-        *(one.task, one.label, one.seeds, *one.real_steps, one.last.value, one.last.low, one.last.high),
-        *(one.worst, one.best, *(one.no_skill.get(name) for name in NAMES.values()), one.level, one.steps),
-        *(one.reached, *better, one.against),
-    )
-    return tuple("" if value is None else str(value) for value in values)
+    values: dict[str, Any] = {
+        "task": one.task,
+        "system": one.label,
+        "seeds": one.seeds,
+        **dict(zip(("fewest real steps", "most real steps"), one.real_steps, strict=True)),
+        "last return": one.last.value,
+        "last return, low": one.last.low,
+        "last return, high": one.last.high,
+        "worst seed": one.worst,
+        "best": one.best,
+        **{name: one.no_skill.get(name) for name in NAMES.values()},
+        "level": one.level,
+        "steps to it": one.steps,
+        "seeds that reach it": one.reached,
+        **dict(zip(("better", "better, low", "better, high"), better, strict=True)),
+        "against": one.against,
+    }
+    return {name: "" if value is None else str(value) for name, value in values.items()}
 
 
 def _return(value: float) -> str:

@@ -42,7 +42,7 @@ class Compare:
 
 def run(command: Compare) -> int:
     """Returns the exit code."""
-    from metrpo.comparison import HEADER, NUMBERS, cells, compare, notes, numbers
+    from metrpo.comparison import HEADER, cells, compare, notes, whole
     from metrpo.report.tables import markdown, written
     from metrpo.run.files import atomic_write
     from metrpo.run.find import find
@@ -54,8 +54,12 @@ def run(command: Compare) -> int:
     table = (HEADER, [cells(one) for one in compared], notes(compared))
     if command.out is not None:
         kind = command.out.suffix.removeprefix(".").lower()
-        shown = (NUMBERS, [numbers(one) for one in compared], []) if kind == "csv" else table
-        atomic_write(command.out, written(kind, *shown))
+        if kind == "csv":
+            rows = [whole(one) for one in compared]
+            text = written(kind, tuple(rows[0]), [tuple(row.values()) for row in rows], [])
+        else:
+            text = written(kind, *table)
+        atomic_write(command.out, text)
     if command.json:
         print(json.dumps([one.plain() for one in compared], indent=1))
     else:

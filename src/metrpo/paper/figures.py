@@ -153,7 +153,7 @@ SCALES: dict[str, Scale] = {
             "validate.starts": 5,
         },
     ),
-    # Days on two cores. The budgets end where the curves are flat, or where a run has taken an hour or two.
+    # Days on two cores. Budgets are to end where curves are flat, or where a run would take more than an hour or two.
     "laptop": Scale(
         "fast",
         seeds={"*": 3, "me-trpo": 5, "svg-1": 2, "svg-inf": 2},

@@ -128,7 +128,7 @@ def _draw_wall_clock(picture: Picture, figure: Figure, curves: list[Curves]) -> 
             note = f"{float(np.mean(values)):.3g}"
             axes.annotate(note, (i, values[0]), xytext=(8, -3), textcoords="offset points", fontsize=9)
     axes.set_xticks(range(len(curves)), [c.task for c in curves])
-    axes.set_yscale("log")
+    make_logarithmic(axes.yaxis)
     axes.set_ylabel("seconds per 1,000 real steps")
     axes.legend(frameon=False, fontsize=9)
 

@@ -129,6 +129,7 @@ def as_markdown(records: Sequence[dict[str, Any]]) -> str:
 def _cells(r: dict[str, Any]) -> tuple[str, ...]:
     steps = r.get("steps", np.nan)
     reached = f"{steps:,.0f} ({r.get('ratio', np.nan):.2g}x)" if np.isfinite(steps) else "not reached"
+    reached = reached if "level" in r else "-"  # the first system has not been run
     return (
         r["task"],
         r["system"],
@@ -136,7 +137,7 @@ def _cells(r: dict[str, Any]) -> tuple[str, ...]:
         f"{np.mean(r['last']):.1f} ({', '.join(f'{x:.1f}' for x in r['last'])})",
         f"{_interval(r['at_common_iqm'])} ({r['common_steps']:,})",
         _interval(r["average_iqm"] if np.isfinite(r["at_common_iqm"][0]) else r["at_common_iqm"]),
-        ", ".join("-" if np.isnan(p) else f"{p:.2f}" for p in r.get("first_better", [])),
+        ", ".join("-" if np.isnan(p) else f"{p:.2f}" for p in r.get("first_better", [np.nan] * 2)),
         reached,
     )
 

@@ -87,6 +87,8 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
         raise ConfigError(f"out: expected a file name that ends in .png, .svg or .pdf, got {path}")
     _require_column(runs, "y", y)
     _require_column(runs, "x", x)
+    _require_positive(runs, "x_scale", look.x_scale, x)
+    _require_positive(runs, "y_scale", look.y_scale, y)
     from matplotlib.figure import Figure  # slow to import
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
@@ -94,9 +96,6 @@ def plot(runs: Sequence[SeenRun], path: Path, x: X = "real_steps", y: str = "ret
     log_y = look.y_scale == "log"
     if look.y_scale == "auto" and y.startswith(RATIOS):
         log_y = all((seed[1] > 0).all() for g in groups for seed in curve(g, x, y).seeds)
-    for name, values, scale in (("x", x, look.x_scale), ("y", y, look.y_scale)):
-        if scale == "log" and not any(_has_positive(run, values) for run in runs):
-            raise ConfigError(f"{name}_scale: expected some {values} above 0 on a logarithmic axis, got none")
     if not groups:
         raise ConfigError(f"y: expected a column that some run has together with {x}, got {y}; choose another --x")
     tasks = list(dict.fromkeys(g.task for g in groups))
@@ -168,8 +167,9 @@ def _add_legend(axes: Axes, where: Legend, room: float) -> None:
             return
 
 
-def _has_positive(run: SeenRun, name: str) -> bool:
-    return bool((run.column(name) > 0).any())
+def _require_positive(runs: Sequence[SeenRun], option: str, scale: AxisScale, name: str) -> None:
+    if scale == "log" and not any((run.column(name) > 0).any() for run in runs):
+        raise ConfigError(f"{option}: expected some {name} above 0 on a logarithmic axis, got none")
 
 
 def _require_column(runs: Sequence[SeenRun], option: str, name: str) -> None:

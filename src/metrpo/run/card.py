@@ -10,6 +10,7 @@ import numpy as np
 
 from metrpo.run.about import about
 from metrpo.run.find import SeenRun
+from metrpo.run.loaded_policy import PolicyInfo
 from metrpo.run.policy_file import load_policy
 
 POINTS = 12
@@ -43,7 +44,8 @@ def model_card(run: SeenRun, repo: str, files: Sequence[str]) -> str:
     """
     card = card_of(run)
     task, system = task_name(card["task"]), card["system"]
-    earned = _earned(run, card)
+    info = load_policy(run.path).info
+    earned = _earned(run, card, info.iteration)
     head: dict[str, Any] = {
         "library_name": "metrpo",
         "pipeline_tag": "reinforcement-learning",
@@ -57,7 +59,7 @@ def model_card(run: SeenRun, repo: str, files: Sequence[str]) -> str:
         }
         head["model-index"] = [{"name": system, "results": [result]}]
     lines = [f"{name}: {json.dumps(value)}" for name, value in head.items()]
-    return "\n".join(["---", *lines, "---", "", *_body(run, card, task, earned, repo, files), ""])
+    return "\n".join(["---", *lines, "---", "", *_body(run, info, card, earned, repo, files), ""])
 
 
 def task_name(text: str) -> str:
@@ -75,8 +77,11 @@ def _method(run: SeenRun) -> str:
     return "Model-Ensemble Trust-Region Policy Optimization, arXiv 1802.10592"
 
 
-def _body(run: SeenRun, card: dict[str, Any], task: str, earned: str, repo: str, files: Sequence[str]) -> list[str]:
+def _body(
+    run: SeenRun, info: PolicyInfo, card: dict[str, Any], earned: str, repo: str, files: Sequence[str]
+) -> list[str]:
     """The card's text, line by line."""
+    task = task_name(info.task)
     code = f"`{task.replace('`', chr(39))}`"
     episodes = run.config.evaluation_episodes
     over = f", mean and standard deviation over {episodes} real episodes without noise" if earned else ""
@@ -102,16 +107,15 @@ def _body(run: SeenRun, card: dict[str, Any], task: str, earned: str, repo: str,
         "```",
         "",
         "`policy(observation)` is the action in [-1, 1], `policy.to_env(action)` the same in the environment's units.",
-        *_what_it_remembers(run),
+        *_limits_and_memory(info),
         f"`metrpo evaluate hub:{repo}{_asks_for_task(task)}` plays it.",
         "`policy.py` is the same policy for machines that have NumPy alone.",
         *(["", "![Learning curve](curve.png)"] if "curve.png" in files else []),
     ]
 
 
-def _what_it_remembers(run: SeenRun) -> list[str]:
-    """That it remembers something within an episode, and its limits."""
-    info = load_policy(run.path).info
+def _limits_and_memory(info: PolicyInfo) -> list[str]:
+    """A line on the limits of its actions, and on what it remembers within an episode; none where neither is."""
     said = []
     if info.max_action < 1 or info.max_change is not None:
         change = "" if info.max_change is None else f", each within {info.max_change:g} of the one before"
@@ -128,11 +132,10 @@ def _asks_for_task(task: str) -> str:
     return f" --task PATH/{task}" if ".py:" in task else f" --task {task}" if ":" in task else ""
 
 
-def _earned(run: SeenRun, card: dict[str, Any]) -> str:
+def _earned(run: SeenRun, card: dict[str, Any], at: int) -> str:
     """The return with its standard deviation, of the evaluation that the policy's file has; empty for none."""
     if card["return"] is None:
         return ""
-    at = load_policy(run.path).info.iteration
     spread = [std for i, std in zip(run.column("iteration"), run.column("return_real_std"), strict=True) if i == at]
     return f"{card['return']:.2f}" + "".join(f" +/- {std:.2f}" for std in spread if np.isfinite(std))
 

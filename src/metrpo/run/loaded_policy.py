@@ -115,10 +115,15 @@ class LoadedPolicy:
         self._last["state"] = state
         return action
 
+    @property
+    def _precision(self) -> type:
+        """Of the states that it is given: an origin is subtracted before they are rounded."""
+        return np.float32 if self.origin is None else np.float64
+
     def _state(self, observation: Any) -> np.ndarray:
         """The state [S] or [B, S] that an observation makes with what came before."""
         layout = self.info.layout
-        observed = _as_batch(observation, layout.observation_size, np.float32 if self.origin is None else np.float64)
+        observed = _as_batch("observation", observation, layout.observation_size, self._precision)
         before, action = self._last.get("state"), self._last.get("taken")
         if before is None:
             return layout.begin(observed)
@@ -140,7 +145,7 @@ class LoadedPolicy:
 
         Raises `ValueError` when the state has another shape, or is not finite in float32.
         """
-        hidden = _as_batch(state, self.info.layout.state_size, np.float32 if self.origin is None else np.float64)
+        hidden = _as_batch("observation", state, self.info.layout.state_size, self._precision)
         if self.origin is not None:
             with np.errstate(over="ignore"):
                 hidden = (hidden - self.origin).astype(np.float32)
@@ -165,26 +170,20 @@ class LoadedPolicy:
         return scaled.astype(np.float32 if exact else np.float64)
 
 
-def _as_batch(observation: Any, size: int, kind: type) -> np.ndarray:
+def _as_batch(name: str, value: Any, size: int, kind: type) -> np.ndarray:
     """Raises `ValueError` unless it is of shape [size] or [B, size]."""
     with np.errstate(over="ignore"):
-        batch: np.ndarray = np.asarray(observation, dtype=kind)
-    _require_shape("observation", batch, size)
+        batch: np.ndarray = np.asarray(value, dtype=kind)
+    if batch.ndim not in (1, 2) or batch.shape[-1] != size:
+        raise ValueError(f"{name}: expected shape [{size}] or [B, {size}], got {list(batch.shape)}")
     return batch
 
 
 def _finite_actions(action: Any, size: int, kind: type) -> np.ndarray:
     """Raises `ValueError` unless they are of shape [size] or [B, size], and finite."""
-    with np.errstate(over="ignore"):
-        batch: np.ndarray = np.asarray(action, dtype=kind)
-    _require_shape("action", batch, size)
+    batch = _as_batch("action", action, size, kind)
     _require_finite("action", batch)
     return batch
-
-
-def _require_shape(name: str, batch: np.ndarray, size: int) -> None:
-    if batch.ndim not in (1, 2) or batch.shape[-1] != size:
-        raise ValueError(f"{name}: expected shape [{size}] or [B, {size}], got {list(batch.shape)}")
 
 
 def _require_finite(name: str, batch: np.ndarray) -> None:

@@ -49,14 +49,8 @@ def act(observation):
 
     Within the limits: call it once a step, and reset() before each episode, where there is a MAX_CHANGE or a HISTORY.
     """
-    with np.errstate(over="ignore"):
-        hidden = np.asarray(observation, dtype=np.$dtype)
-    if hidden.ndim not in (1, 2) or hidden.shape[-1] != OBSERVATION_SIZE:
-        size = OBSERVATION_SIZE
-        raise ValueError(f"observation: expected shape [{size}] or [B, {size}], got {list(hidden.shape)}")
-$begin$relative    if not np.isfinite(hidden).all():
-        at = np.argwhere(~np.isfinite(hidden))[0]
-        raise ValueError(f"observation: expected finite numbers, got {hidden[tuple(at)]} at {at.tolist()}")
+    hidden = _as_batch("observation", observation, OBSERVATION_SIZE, np.$dtype)
+$begin$relative    _require_finite("observation", hidden)
     for weights, bias in _LAYERS[:-1]:
         hidden = np.tanh(hidden @ weights + bias)
     weights, bias = _LAYERS[-1]
@@ -68,7 +62,7 @@ def limited(action):
 
     ValueError for other shapes, NaN or infinity.
     """
-    action = _actions(action, np.float32)
+    action = _finite_actions(action, np.float32)
     if MAX_CHANGE is not None:
         before = _last.get("action", np.zeros_like(action))
         if before.shape != action.shape:
@@ -85,7 +79,7 @@ def to_env(action):
     if ACTION_LOW is None or ACTION_HIGH is None:
         raise ValueError("this policy does not say its environment's range of actions: scale them yourself")
     low, high = np.array(ACTION_LOW, dtype=np.float64), np.array(ACTION_HIGH, dtype=np.float64)
-    part = 0.5 * (np.clip(_actions(action, np.float64), -1.0, 1.0) + 1.0)
+    part = 0.5 * (np.clip(_finite_actions(action, np.float64), -1.0, 1.0) + 1.0)
     scaled = np.clip((1.0 - part) * low + part * high, low, high)
     exact = np.array_equal(low, np.float32(low)) and np.array_equal(high, np.float32(high))
     return scaled.astype(np.float32 if exact else np.float64)
@@ -96,15 +90,24 @@ def control(observation):
     return to_env(act(observation))
 
 
-def _actions(action, kind):
+def _finite_actions(action, kind):
+    batch = _as_batch("action", action, ACTION_SIZE, kind)
+    _require_finite("action", batch)
+    return batch
+
+
+def _as_batch(name, value, size, kind):
     with np.errstate(over="ignore"):
-        action = np.asarray(action, dtype=kind)
-    if action.ndim not in (1, 2) or action.shape[-1] != ACTION_SIZE:
-        raise ValueError(f"action: expected shape [{ACTION_SIZE}] or [B, {ACTION_SIZE}], got {list(action.shape)}")
-    if not np.isfinite(action).all():
-        at = np.argwhere(~np.isfinite(action))[0]
-        raise ValueError(f"action: expected finite numbers, got {action[tuple(at)]} at {at.tolist()}")
-    return action
+        batch = np.asarray(value, dtype=kind)
+    if batch.ndim not in (1, 2) or batch.shape[-1] != size:
+        raise ValueError(f"{name}: expected shape [{size}] or [B, {size}], got {list(batch.shape)}")
+    return batch
+
+
+def _require_finite(name, batch):
+    if not np.isfinite(batch).all():
+        at = np.argwhere(~np.isfinite(batch))[0]
+        raise ValueError(f"{name}: expected finite numbers, got {batch[tuple(at)]} at {at.tolist()}")
 
 
 def _layers(text):
