@@ -121,6 +121,9 @@ BY_CRITICS: dict[str, Overrides] = {
 }
 """Tasks of short episodes that the actor-critic learns from fewer real steps: what differs for them."""
 
+NOT_BY_CRITICS = frozenset({"HopperUpright"})
+"""Variants of these that `me-trpo` learns sooner (docs/fast-preset.md, "Runs of record")."""
+
 
 ONLY_ME_TRPO = frozenset({"improver", "method", "max_action", "max_change"})
 """Settings that the actor-critic cannot have."""
@@ -139,7 +142,7 @@ def usual_system(task: str, name: str, settings: Mapping[str, Any]) -> System:
         return "me-trpo"
     row = SAME_AS.get(task, task)
     if row in PAPER:
-        return "actor-critic" if row in BY_CRITICS else "me-trpo"
+        return "actor-critic" if row in BY_CRITICS and task not in NOT_BY_CRITICS else "me-trpo"
     return "actor-critic" if _horizon(task, _chosen(settings)) > LONG else "me-trpo"
 
 
