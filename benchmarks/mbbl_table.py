@@ -2,7 +2,7 @@
 
 Published: Wang et al. 2019, Benchmarking Model-Based Reinforcement Learning (arXiv 1907.02057), returns after 200,000
 real steps, mean and standard deviation over its seeds, in `results/published/mbbl_200k.csv`. Ours: the last real return
-(deterministic policy, mean of 20 episodes) of every run in `results/own/mbbl-*/long-horizon`.
+(deterministic policy) of every run in `results/own/mbbl-*/actor-critic` and `.../long-horizon`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ from summarise import ROOT
 from metrpo import read_metrics
 from metrpo.report.tables import markdown
 
-OURS = "metrpo, long-horizon"
+OURS = ("actor-critic", "long-horizon")
+"""Folders, a row each."""
 
 
-def ours(task: str) -> str:
+def ours(task: str, folder: str) -> str:
     """Mean and standard deviation over the seeds, and after how many real steps."""
-    runs = [read_metrics(path) for path in sorted((ROOT / "own").glob(f"mbbl-{task}/long-horizon/seed-*/metrics.csv"))]
+    runs = [read_metrics(path) for path in sorted((ROOT / "own").glob(f"mbbl-{task}/{folder}/seed-*/metrics.csv"))]
     if not runs:
         return "not run"
     last = np.array([run[-1]["return_real"] for run in runs], float)
@@ -30,11 +31,12 @@ def ours(task: str) -> str:
 
 
 def table() -> str:
-    """The table as Markdown: our row, then the published ones."""
+    """The table as Markdown: our rows, then the published ones."""
     with (ROOT / "published" / "mbbl_200k.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     tasks = [name for name in rows[0] if name != "algo"]
-    return markdown(["", *tasks], [[OURS, *map(ours, tasks)], *([*row.values()] for row in rows)])
+    mine = [[f"metrpo, {folder}", *(ours(task, folder) for task in tasks)] for folder in OURS]
+    return markdown(["", *tasks], [*mine, *([*row.values()] for row in rows)])
 
 
 if __name__ == "__main__":

@@ -204,7 +204,25 @@ def test_it_acts_at_random_first_and_then_by_the_actor(small):
     actor = squashed.on_host(small.states[1].baseline.actor)
     seen = normalised(inputs_for(SMALL, probe.PROBE, small.states[1].dataset), np.zeros(2))
     rng = np.random.default_rng(0)
-    np.testing.assert_array_equal(later, [squashed.draw(actor, seen, rng) for _ in range(300)])
+    np.testing.assert_array_equal(later, [squashed.draw(actor, seen, rng.standard_normal(2)) for _ in range(300)])
+
+
+@pytest.mark.parametrize("iteration", [0, 1])
+def test_noise_may_last_for_steps_and_actions_are_spread_as_ever(small, iteration):
+    config, state = override(SMALL, {"collect.noise_correlation": 0.9}), small.states[iteration]
+    explore = actor_critic_search.explorer(config, probe.PROBE, state)
+    episodes = np.arctanh([_acted(explore(np.random.default_rng(seed)), 60) for seed in range(200)])
+    means, stds = episodes.mean(axis=(0, 1)), episodes.std(axis=(0, 1))
+    z = (episodes - means) / stds
+    assert np.mean(z[:, :-1] * z[:, 1:]) == pytest.approx(0.9, abs=0.03)
+    assert np.mean(z[:, 0] ** 2) == pytest.approx(1.0, abs=0.2), "from the first step on"
+    plain = actor_critic_search.explorer(SMALL, probe.PROBE, state)
+    usual = np.arctanh(_acted(plain(np.random.default_rng(0)), 4000))
+    np.testing.assert_allclose((means, stds), (usual.mean(axis=0), usual.std(axis=0)), atol=0.1)
+
+
+def _acted(act, steps):
+    return np.array([act(np.zeros(2)) for _ in range(steps)])
 
 
 def test_real_steps_are_those_of_the_dataset_with_rewards_and_ends(small):

@@ -42,7 +42,7 @@ _READERS = {
     "collect.max_std": _PHASE,
     "collect.max_train": _MODEL,
     "collect.max_validation": _ENSEMBLE,
-    "collect.noise_correlation": _PHASE,
+    "collect.noise_correlation": _ENSEMBLE,
     "collect.parameter_noise": _PHASE,
     "collect.piece": _ENSEMBLE,
     "collect.std_per": _PHASE,

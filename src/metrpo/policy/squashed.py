@@ -55,10 +55,10 @@ def log_slope(x: Array) -> Array:
     return 2.0 * (math.log(2.0) - x - jax.nn.softplus(-2.0 * x))
 
 
-def draw(actor: Actor, states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Actions in real states [..., S], with NumPy alone."""
+def draw(actor: Actor, states: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Actions in real states [..., S], with NumPy alone, out of `noise` N(0, I) [..., A]."""
     means, log_std = moments(actor, states)
-    return np.tanh(means + np.exp(log_std) * rng.standard_normal(means.shape))
+    return np.tanh(means + np.exp(log_std) * noise)
 
 
 def mean_policy(actor: Actor, inputs: Inputs | None, states: np.ndarray) -> Policy:

@@ -57,19 +57,27 @@ def fresh(config: Config, task: Task, key: Array) -> tuple[Policy, Learner]:
 
 
 def explorer(config: Config, task: Task, state: State) -> Callable[[np.random.Generator], real.Act]:
-    """What acts in an episode: uniformly random actions at first, then the actor."""
+    """What acts in an episode: uniformly random actions at first, then the actor. Its noise is `real.correlated`."""
     inputs, actor = inputs_for(config, task, state.dataset), squashed.on_host(state.baseline.actor)
     at_random = state.iteration == 0
 
     def draw_act(rng: np.random.Generator) -> real.Act:
+        noise = real.correlated(config.collect.noise_correlation, rng)
+
         def act(observed: np.ndarray) -> np.ndarray:
+            step = noise(task.action_size)
             if at_random:
-                return rng.uniform(-1.0, 1.0, task.action_size)
-            return squashed.draw(actor, normalised(inputs, observed), rng)
+                return uniform(step)
+            return squashed.draw(actor, normalised(inputs, observed), step)
 
         return of_real(act, state.origin)
 
     return draw_act
+
+
+def uniform(noise: np.ndarray) -> np.ndarray:
+    """Numbers N(0, 1) as numbers uniform in [-1, 1]: what was correlated stays so."""
+    return np.vectorize(math.erf)(noise / math.sqrt(2))
 
 
 def improve_policy(

@@ -136,8 +136,7 @@ def reset_states(task: Task, count: int, rng: np.random.Generator) -> np.ndarray
 def explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
     """`mean` plus std x noise, std = max_std x U[0, 1] ** std_power per episode or step.
 
-    The noise of a step is N(0, I), and correlated with that of the step before: a first-order autoregressive process.
-    The paper (appendix A.1.1) has the power 1 and no correlation.
+    The noise is `correlated`. The paper (appendix A.1.1) has the power 1 and no correlation.
     """
 
     def draw() -> float:
@@ -150,17 +149,30 @@ def explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
             if config.std_per == "step":
                 std = draw()
 
-    std, kept, last = stds(), config.noise_correlation, list[np.ndarray]()
+    std, noise = stds(), correlated(config.noise_correlation, rng)
 
     def act(state: np.ndarray) -> np.ndarray:
         action, width = mean(state), next(std)  # drawn before the noise
-        noise = rng.standard_normal(action.shape)
-        if last:
-            noise = kept * last.pop() + math.sqrt(1 - kept**2) * noise
-        last.append(noise)
-        return action + width * noise
+        return action + width * noise(action.size).reshape(action.shape)
 
     return act
+
+
+def correlated(correlation: float, rng: np.random.Generator) -> Callable[[int], np.ndarray]:
+    """Noise for the steps of an episode, so many numbers N(0, 1) for each.
+
+    It is correlated with that of the step before: a first-order autoregressive process.
+    """
+    last = list[np.ndarray]()
+
+    def step(size: int) -> np.ndarray:
+        noise = rng.standard_normal(size)
+        if last:
+            noise = correlation * last.pop() + math.sqrt(1 - correlation**2) * noise
+        last.append(noise)
+        return noise
+
+    return step
 
 
 def _episode(
