@@ -65,9 +65,9 @@ def explorer(config: Config, task: Task, state: State) -> Callable[[np.random.Ge
         noise = real.correlated(config.collect.noise_correlation, rng)
 
         def act(observed: np.ndarray) -> np.ndarray:
-            step = noise(task.action_size)
+            step = noise((task.action_size,))
             if at_random:
-                return uniform(step)
+                return _uniform(step)
             return squashed.draw(actor, normalised(inputs, observed), step)
 
         return of_real(act, state.origin)
@@ -75,7 +75,7 @@ def explorer(config: Config, task: Task, state: State) -> Callable[[np.random.Ge
     return draw_act
 
 
-def uniform(noise: np.ndarray) -> np.ndarray:
+def _uniform(noise: np.ndarray) -> np.ndarray:
     """Numbers N(0, 1) as numbers uniform in [-1, 1]: what was correlated stays so."""
     return np.vectorize(math.erf)(noise / math.sqrt(2))
 

@@ -153,20 +153,20 @@ def explore(mean: Act, config: CollectConfig, rng: np.random.Generator) -> Act:
 
     def act(state: np.ndarray) -> np.ndarray:
         action, width = mean(state), next(std)  # drawn before the noise
-        return action + width * noise(action.size).reshape(action.shape)
+        return action + width * noise(action.shape)
 
     return act
 
 
-def correlated(correlation: float, rng: np.random.Generator) -> Callable[[int], np.ndarray]:
-    """Noise for the steps of an episode, so many numbers N(0, 1) for each.
+def correlated(correlation: float, rng: np.random.Generator) -> Callable[[tuple[int, ...]], np.ndarray]:
+    """Noise for the steps of an episode, an array N(0, I) of the given shape for each.
 
     It is correlated with that of the step before: a first-order autoregressive process.
     """
     last = list[np.ndarray]()
 
-    def step(size: int) -> np.ndarray:
-        noise = rng.standard_normal(size)
+    def step(shape: tuple[int, ...]) -> np.ndarray:
+        noise = rng.standard_normal(shape)
         if last:
             noise = correlation * last.pop() + math.sqrt(1 - correlation**2) * noise
         last.append(noise)
