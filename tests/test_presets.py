@@ -12,7 +12,16 @@ from metrpo.commands.parse import parse
 from metrpo.config import Config, Preset, System, flatten, from_json, require_consistent, to_json
 from metrpo.errors import ConfigError
 from metrpo.launch.grid import Grid
-from metrpo.presets import BY_CRITICS, LONG_HORIZON_ALL, SHORT_BY_CRITICS, configured, override, preset
+from metrpo.presets import (
+    BY_CRITICS,
+    LONG_BY_CRITICS,
+    LONG_HORIZON_ALL,
+    PAPER,
+    SHORT_BY_CRITICS,
+    configured,
+    override,
+    preset,
+)
 from metrpo.systems import SYSTEMS
 from metrpo.tune.search import Search
 from metrpo.tune.space import Choices
@@ -202,6 +211,8 @@ def test_long_horizon_changes_what_its_row_says_and_nothing_else(task):
     [
         ("HalfCheetah-v5", {}, "actor-critic"),
         ("mbbl/HalfCheetah", {}, "actor-critic"),
+        ("mbbl/Swimmer", {}, "actor-critic"),
+        ("mbbl/Swimmer", {"improver": "trpo"}, "me-trpo"),
         ("Pendulum-v1", {}, "me-trpo"),
         ("Swimmer", {}, "me-trpo"),
         ("HalfCheetah", {}, "me-trpo"),
@@ -235,7 +246,8 @@ def test_other_presets_have_one_usual_system(name, task):
 def test_a_task_of_the_critics_differs_from_their_system_in_its_row_alone():
     for task, row in BY_CRITICS.items():
         usual, me_trpo = flatten(preset(task)), flatten(preset(task, system="me-trpo"))
-        assert usual == me_trpo | SYSTEMS["actor-critic"] | SHORT_BY_CRITICS | {"system": "actor-critic"} | row
+        by_length = SHORT_BY_CRITICS if task in PAPER else LONG_BY_CRITICS
+        assert usual == me_trpo | SYSTEMS["actor-critic"] | by_length | {"system": "actor-critic"} | row
         # Who asks for a setting gets it.
         assert preset(task, iterations=3).iterations == 3
         assert not configured(task, "fast", None, {"ensemble.probabilistic": False}).ensemble.probabilistic
