@@ -8,6 +8,7 @@ import sys
 import types
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 from PIL import Image
@@ -244,6 +245,26 @@ def test_other_environments_draw_by_the_library_that_ours_would_take(own, found,
     record(Drawn, zero, tmp_path / "video.gif")
     assert set(asked) == {seen}
     assert os.environ.get("MUJOCO_GL") == own
+
+
+@pytest.mark.parametrize(
+    ("name", "asked", "camera"),
+    [
+        ("HalfCheetah-v5", {}, "track"),
+        ("Hopper-v5", {}, "track"),
+        ("mbbl/HalfCheetah", {}, "track"),
+        ("mbbl/Swimmer", {}, "track"),
+        ("InvertedPendulum-v5", {}, None),  # it has none
+        ("HalfCheetah-v5", {"camera_id": -1}, None),
+        ("mbbl/Hopper", {"camera_id": -1}, None),
+        ("Hopper-v5", {"default_camera_config": {"distance": 9.0}}, None),
+    ],
+)
+def test_the_camera_follows_a_robot_unless_another_is_asked_for(name, asked, camera):
+    env = get_task(name, env_kwargs=asked).make_env(render_mode="rgb_array")
+    renderer = env.unwrapped.mujoco_renderer
+    video._follow(env)
+    assert mujoco.mj_id2name(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, renderer.camera_id) == camera
 
 
 def test_an_error_of_the_environment_passes_whatever_draws_it(tmp_path, monkeypatch):

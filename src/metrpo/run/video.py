@@ -126,6 +126,7 @@ def _episode(
     except Exception as error:  # whatever somebody's constructor raises
         raise _blame(error, 'cannot create the environment with render_mode="rgb_array"') from error
     with env_returns.closing(env, "the environment"):
+        _follow(env)
         observation, _ = env.reset(seed=seed)
         frames, over = [_frame(env)], False
         while not over and len(frames) <= FRAMES:
@@ -133,6 +134,21 @@ def _episode(
             over = terminated or truncated
             frames.append(_frame(env))
         return frames, int(env.metadata.get("render_fps", 30))
+
+
+def _follow(env: Any) -> None:
+    """Lets the model's camera "track" draw, if it has one and nobody asked for another.
+
+    The camera of Gymnasium's MuJoCo tasks stands still, and whatever runs leaves the picture.
+    """
+    inner = getattr(env, "unwrapped", env)
+    renderer, spec = getattr(inner, "mujoco_renderer", None), getattr(inner, "spec", None)
+    asked = getattr(spec, "kwargs", {}).keys() & {"camera_id", "camera_name", "default_camera_config"}
+    if renderer is None or asked or renderer.camera_id != -1:
+        return
+    import mujoco  # only where the environment is of MuJoCo
+
+    renderer.camera_id = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
 
 
 def _frame(env: Any) -> np.ndarray:

@@ -98,6 +98,11 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         return np.clip(scaled, self._actions.low, self._actions.high)  # the last bit may have been rounded beyond
 
     @property
+    def unwrapped(self) -> gymnasium.Env[Any, Any]:
+        """The environment inside, without any wrapper."""
+        return self._env.unwrapped
+
+    @property
     def time_limit(self) -> int | None:
         """Steps after which an episode is cut off, by us, by a wrapper or by its registration; None: unknown."""
         if self._horizon is not None:

@@ -539,11 +539,3 @@ def test_random_actions_get_about_what_the_benchmark_reports(name, mean, std):
     for _ in range(mbbl.TASKS[name.removeprefix("mbbl/")].horizon):
         total += env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))[1]
     assert abs(total - mean) < 4 * std
-
-
-@pytest.mark.parametrize("name", ["HalfCheetah", "Swimmer", "Hopper", "Ant"])
-@pytest.mark.parametrize(("asked", "camera"), [({}, "track"), ({"camera_id": -1}, None)])
-def test_the_camera_follows_mbbls_robots_unless_another_is_asked_for(name, asked, camera):
-    env = mbbl.MbblRobot(name, render_mode="rgb_array", **asked)
-    number = env.mujoco_renderer.camera_id
-    assert mujoco.mj_id2name(env.model, mujoco.mjtObj.mjOBJ_CAMERA, number) == camera

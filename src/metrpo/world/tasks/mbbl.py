@@ -94,8 +94,6 @@ class MbblRobot(MujocoEnv):
 
     def __init__(self, name: str, render_mode: str | None = None, **kwargs: Any) -> None:
         self._name, self._robot, self._reward = name, _ROBOTS[name], TASKS[name].reward
-        if not kwargs.keys() & {"camera_id", "camera_name"}:
-            kwargs["camera_name"] = "track"  # Gymnasium's default stands still, and the robot leaves the picture
         super().__init__(self._robot.asset, self._robot.frame_skip, None, render_mode, **kwargs)
         self.metadata = {**self.metadata, "render_fps": round(1 / self.dt)}
         self._tip_speed = 0.0
