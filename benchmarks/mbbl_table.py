@@ -2,7 +2,8 @@
 
 Published: Wang et al. 2019, Benchmarking Model-Based Reinforcement Learning (arXiv 1907.02057), returns after 200,000
 real steps, mean and standard deviation over its seeds, in `results/published/mbbl_200k.csv`. Ours: the last real return
-(deterministic policy) of every run in `results/own/mbbl-*/actor-critic` and `.../long-horizon`.
+(deterministic policy) of every run in `results/own/mbbl-*/actor-critic` and `.../long-horizon`; and what doing nothing
+earns (`results/yardsticks.json`), which on Ant is more than most methods have.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import csv
 
 import numpy as np
-from summarise import ROOT
+from summarise import ROOT, no_skill
 
 from metrpo import read_metrics
 from metrpo.report.tables import markdown
@@ -31,12 +32,13 @@ def ours(task: str, folder: str) -> str:
 
 
 def table() -> str:
-    """The table as Markdown: our rows, then the published ones."""
+    """The table as Markdown: our rows, what doing nothing earns, then the published ones."""
     with (ROOT / "published" / "mbbl_200k.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     tasks = [name for name in rows[0] if name != "algo"]
     mine = [[f"metrpo, {folder}", *(ours(task, folder) for task in tasks)] for folder in OURS]
-    return markdown(["", *tasks], [*mine, *([*row.values()] for row in rows)])
+    nothing = ["doing nothing", *(no_skill(f"mbbl/{task}")[0] for task in tasks)]
+    return markdown(["", *tasks], [*mine, nothing, *([*row.values()] for row in rows)])
 
 
 if __name__ == "__main__":

@@ -119,7 +119,11 @@ BY_CRITICS: dict[str, Overrides] = {
     "Ant": {"iterations": 43} | _SLOWER,  # some 15,000
     "Humanoid": {"iterations": 20} | _SLOWER,  # some 8,700
     # It coasts: noise that changes with every step shows no stroke, and models promise speeds that no swimmer has.
-    "mbbl/Swimmer": {"collect.noise_correlation": 0.9, "actor_critic.agreement": 0.05},
+    "mbbl/Swimmer": {
+        "actor_critic.agreement": 0.05,
+        "actor_critic.entropy_target": -2.0,
+        "collect.noise_correlation": 0.9,
+    },
 }
 """What differs for tasks of the actor-critic: the paper's tasks that it learns from fewer real steps, and others."""
 
