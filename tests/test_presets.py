@@ -289,6 +289,14 @@ def test_long_episodes_have_a_budget_of_real_steps_until_iterations_are_asked_fo
     assert override(Config("Swimmer", data="log.npz", real_steps=0), {"iterations": 5}).real_steps == 0
 
 
+def test_a_run_has_one_budget():
+    both = {"iterations": 5, "real_steps": 4000}
+    for config in (lambda: preset("Swimmer", **both), lambda: configured("HalfCheetah-v5", "fast", None, both)):
+        with pytest.raises(ConfigError, match="expected iterations or real_steps, got both"):
+            config()
+    assert preset("Swimmer", iterations=5, real_steps=0, data="log.npz").iterations == 5  # no steps at all: offline
+
+
 def test_only_options_decide_the_system_not_their_values():
     def words(*more):
         return parse(["train", "HalfCheetah-v5", *more]).system

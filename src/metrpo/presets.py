@@ -156,8 +156,9 @@ def preset(task: str, name: str = "fast", system: str | None = None, **top_level
     """The config of a preset for a task and a system, with `top_level` settings such as `seed=1`.
 
     A system of None is the task's usual one (`usual_system`). Raises `ConfigError` for an unknown preset, system or
-    setting.
+    setting, and for two budgets.
     """
+    _require_one_budget(top_level)
     if "preset" in top_level:
         got = top_level["preset"]
         raise ConfigError(f"preset: expected its name as the second argument, or as name=, got preset={got!r}")
@@ -181,6 +182,12 @@ def preset(task: str, name: str = "fast", system: str | None = None, **top_level
     return override(override(config, overrides | {"system": system}), top_level)
 
 
+def _require_one_budget(settings: Mapping[str, Any]) -> None:
+    """`real_steps` would end the run, and `iterations` be passed over in silence."""
+    if settings.get("iterations") is not None and settings.get("real_steps"):
+        raise ConfigError("expected iterations or real_steps, got both; leave one out")
+
+
 def _chosen(settings: Mapping[str, Any]) -> Overrides:
     """Those of the settings that a task may need to be found, or to have its horizon."""
     return {name: settings[name] for name in ("env_kwargs", "imports") if name in settings}
@@ -194,6 +201,7 @@ def bare(task: str, name: str, system: str | None, settings: Overrides) -> Confi
 
 def configured(task: str, name: str, system: str | None, settings: Overrides) -> Config:
     """The config of a preset with dotted `settings` on top. Raises `ConfigError` as `preset` and `override`."""
+    _require_one_budget(settings)
     return override(bare(task, name, system, settings), settings)
 
 
