@@ -1,7 +1,7 @@
 """The table of the README: returns beside what no skill earns and, where it was searched, the ceiling.
 
-`python benchmarks/fill_tables.py` puts it into the README, from results/fast or results/laptop, results/yardsticks.json
-(`yardsticks.py`) and results/ceilings (`ceiling.py`).
+`python benchmarks/fill_tables.py` puts it into the README, from results/fast, results/laptop or results/own,
+results/yardsticks.json (`yardsticks.py`) and results/ceilings (`ceiling.py`).
 """
 
 from __future__ import annotations
@@ -14,10 +14,15 @@ from summarise import ROOT, no_skill, real_steps
 from metrpo import read_metrics
 from metrpo.presets import usual_system
 from metrpo.report.tables import markdown
+from metrpo.run.files import folder_name
 
-FOLDERS = ("fast", "laptop")
-"""Of results/: a task's row is of the first one that has runs of it, those of the preset as it is, or as it was."""
-TASKS = ("Swimmer", "Snake", "HalfCheetah", "Hopper", "HopperUpright", "Ant", "Humanoid", "HumanoidStandup")
+FOLDERS = ("fast", "laptop", "own")
+"""Of results/: a task's row is of the first one that has runs of it, those of the preset as it is, or as it was; tasks
+outside the paper have the last one."""
+TASKS = (
+    *("Swimmer", "Snake", "HalfCheetah", "Hopper", "HopperUpright", "Ant", "Humanoid", "HumanoidStandup"),
+    *("mbbl/Swimmer", "mbbl/HalfCheetah", "mbbl/Hopper", "mbbl/Ant"),
+)
 HEADER = (
     "task",
     "system",
@@ -39,8 +44,9 @@ def table() -> str:
 
 def _row(task: str) -> tuple[str, ...] | None:
     # The preset as it is has the task's usual system; as it was, all were learned by me-trpo.
-    systems = {"fast": usual_system(task, "fast", {}), "laptop": "me-trpo"}
-    found = {name: sorted((ROOT / name / task / systems[name]).glob("seed-*/metrics.csv")) for name in FOLDERS}
+    systems = dict.fromkeys(FOLDERS, usual_system(task, "fast", {})) | {"laptop": "me-trpo"}
+    folders = {name: ROOT / name / folder_name(task) for name in FOLDERS}
+    found = {name: sorted((folders[name] / systems[name]).glob("seed-*/metrics.csv")) for name in FOLDERS}
     folder = next((name for name in FOLDERS if found[name]), None)
     if folder is None:
         return None
@@ -57,5 +63,5 @@ def _row(task: str) -> tuple[str, ...] | None:
         f"{np.min(returns):.1f}",
         *no_skill(task),
         ceiling,
-        f"[{folder}](results/{folder}/{task})",
+        f"[{folder}](results/{folder}/{folder_name(task)})",
     )
