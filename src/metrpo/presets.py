@@ -123,7 +123,6 @@ BY_CRITICS: dict[str, Overrides] = {
         "actor_critic.agreement": 0.05,
         "actor_critic.entropy_target": -2.0,
         "collect.noise_correlation": 0.9,
-        "real_steps": 30_000,  # by then trials have stopped rising
     },
 }
 """What differs for tasks of the actor-critic: the paper's tasks that it learns from fewer real steps, and others."""
