@@ -118,7 +118,7 @@ BY_CRITICS: dict[str, Overrides] = {
     "Hopper": {"iterations": 140},  # some 45,000
     "Ant": {"iterations": 43} | _SLOWER,  # some 15,000
     "Humanoid": {"iterations": 20} | _SLOWER,  # some 8,700
-    # It coasts: noise that changes with every step shows no stroke, and models promise speeds that no swimmer has.
+    # The default stays below 100, where models promise twice what any swimmer earns (docs/actor-critic-trials.md).
     "mbbl/Swimmer": {
         "actor_critic.agreement": 0.05,
         "actor_critic.entropy_target": -2.0,

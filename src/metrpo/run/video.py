@@ -142,9 +142,11 @@ def _follow(env: Any) -> None:
     The camera of Gymnasium's MuJoCo tasks stands still, and whatever runs leaves the picture.
     """
     inner = getattr(env, "unwrapped", env)
-    renderer, spec = getattr(inner, "mujoco_renderer", None), getattr(inner, "spec", None)
-    asked = getattr(spec, "kwargs", {}).keys() & {"camera_id", "camera_name", "default_camera_config"}
-    if renderer is None or asked or renderer.camera_id != -1:
+    renderer: Any = getattr(inner, "mujoco_renderer", None)
+    spec: Any = getattr(inner, "spec", None)
+    if getattr(renderer, "camera_id", None) != -1:  # not Gymnasium's, or not its free camera
+        return
+    if spec is not None and spec.kwargs.keys() & {"camera_id", "camera_name", "default_camera_config"}:
         return
     import mujoco  # only where the environment is of MuJoCo
 
