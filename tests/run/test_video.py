@@ -263,7 +263,7 @@ def test_other_environments_draw_by_the_library_that_ours_would_take(own, found,
 def test_the_camera_follows_a_robot_unless_another_is_asked_for(name, asked, camera, tmp_path, monkeypatch):
     monkeypatch.setattr(video, "FRAMES", 1)
     env = get_task(name, env_kwargs=asked).make_env(render_mode="rgb_array")
-    renderer, still = env.unwrapped.mujoco_renderer, np.zeros(env.action_space.shape, np.float32)
+    renderer, still = getattr(env, "inner", env.unwrapped).mujoco_renderer, np.zeros(env.action_space.shape, np.float32)
     env.render = lambda: np.zeros((16, 16, 3), np.uint8)  # what is drawn needs OpenGL, the choice of a camera does not
     record(lambda render_mode: env, lambda state: still, tmp_path / "video.gif")
     assert mujoco.mj_id2name(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, renderer.camera_id) == camera

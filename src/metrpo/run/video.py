@@ -18,6 +18,7 @@ import numpy as np
 from metrpo.errors import MetrpoError
 from metrpo.run.files import temporary_path
 from metrpo.world import env_returns
+from metrpo.world.env_wrapper import Guarded
 from metrpo.world.opengl import INSTALL_GL, gl_library
 
 INSTALL_EXTRA = "pip install 'metrpo[video]'"
@@ -141,7 +142,7 @@ def _follow(env: Any) -> None:
 
     The camera of Gymnasium's MuJoCo tasks stands still, and whatever runs leaves the picture.
     """
-    inner = getattr(env, "unwrapped", env)
+    inner = env.inner if isinstance(env, Guarded) else getattr(env, "unwrapped", env)
     renderer: Any = getattr(inner, "mujoco_renderer", None)
     spec: Any = getattr(inner, "spec", None)
     if getattr(renderer, "camera_id", None) != -1:  # not Gymnasium's, or not its free camera

@@ -98,8 +98,8 @@ class Guarded(gymnasium.Env[NDArray[np.float64], NDArray[np.float32]]):
         return np.clip(scaled, self._actions.low, self._actions.high)  # the last bit may have been rounded beyond
 
     @property
-    def unwrapped(self) -> gymnasium.Env[Any, Any]:
-        """The environment inside, without any wrapper."""
+    def inner(self) -> gymnasium.Env[Any, Any]:
+        """The guarded environment, without any wrapper; `unwrapped` is this one, as Gymnasium's own check expects."""
         return self._env.unwrapped
 
     @property
