@@ -18,6 +18,7 @@ from metrpo.run import video
 from metrpo.run.metrics import to_csv
 from metrpo.run.policy_file import Learned, save_policy
 from metrpo.run.video import VideoError, gl_backend, has_encoder, record
+from metrpo.world import opengl
 from metrpo.world.registry import get_task
 
 needs_encoder = pytest.mark.skipif(not has_encoder(), reason="no video encoder (extra `video`)")
@@ -234,7 +235,7 @@ def test_other_environments_draw_by_the_library_that_ours_would_take(own, found,
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     if own:
         monkeypatch.setenv("MUJOCO_GL", own)
-    monkeypatch.setattr(video, "gl_library", lambda: found)
+    monkeypatch.setattr(opengl, "gl_library", lambda: found)
     asked = []
 
     class Drawn(Pictures):
@@ -271,7 +272,7 @@ def test_the_camera_follows_a_robot_unless_another_is_asked_for(name, asked, cam
 
 def test_an_error_of_the_environment_passes_whatever_draws_it(tmp_path, monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(video, "gl_library", lambda: "osmesa")
+    monkeypatch.setattr(opengl, "gl_library", lambda: "osmesa")
 
     class Broken(Pictures):
         def step(self, action):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import textwrap
+import types
 
 import gymnasium
 import jax
@@ -21,7 +23,7 @@ from metrpo.model.sampling import SAMPLINGS
 from metrpo.presets import override, preset
 from metrpo.world import collection as real
 from metrpo.world import dataset as datasets
-from metrpo.world import registry, resolve
+from metrpo.world import opengl, registry, resolve
 from metrpo.world.env_wrapper import Guarded
 from metrpo.world.formula_check import check_formulas
 from metrpo.world.registry import get_task, task_for
@@ -549,3 +551,46 @@ def test_the_probe_is_learned_in_episodes_of_five_steps(blind):
     optimum = probe.optimum()
     after = probe.real_return(training.train(override(LEARN, SHORT)).policy)
     assert 1.5 * optimum <= after <= optimum * 0.9999
+
+
+@pytest.fixture
+def shimmy(monkeypatch):
+    """Stands for the package: what its import does is up to the test; what it saw of MUJOCO_GL is listed."""
+    found = types.SimpleNamespace(seen=[], raises=None)
+
+    def import_module(name):
+        assert name == "shimmy"
+        found.seen.append(os.environ.get("MUJOCO_GL"))
+        if found.raises is not None:
+            raise found.raises
+        return types.ModuleType(name)
+
+    monkeypatch.setattr(resolve.importlib, "import_module", import_module)
+    monkeypatch.setattr(gymnasium, "register_envs", lambda module: None)
+    monkeypatch.setattr(opengl, "gl_library", lambda: "osmesa")
+    return found
+
+
+@pytest.mark.parametrize(("own", "seen"), [(None, "osmesa"), ("egl", "egl")])
+def test_dm_control_is_imported_with_the_library_that_ours_would_take(own, seen, shimmy, monkeypatch):
+    """It settles for one then; by itself for GLFW, which cannot draw without a display."""
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    if own:
+        monkeypatch.setenv("MUJOCO_GL", own)
+    resolve._register_dm_control()
+    assert shimmy.seen == [seen]
+    assert os.environ.get("MUJOCO_GL") == own
+
+
+@pytest.mark.parametrize(
+    ("raised", "said"),
+    [
+        (ModuleNotFoundError("No module named 'shimmy'"), r"need Shimmy: pip install 'metrpo\[dm-control\]'"),
+        (ImportError("no EGL device"), "cannot be imported: ImportError: no EGL device"),
+        (RuntimeError("MUJOCO_GL must be one of"), "cannot be imported: RuntimeError: MUJOCO_GL must be one of"),
+    ],
+)
+def test_what_keeps_dm_control_from_being_imported_is_said(raised, said, shimmy):
+    shimmy.raises = raised
+    with pytest.raises(TaskError, match=said):
+        resolve._register_dm_control()

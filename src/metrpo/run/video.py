@@ -8,7 +8,7 @@ import subprocess
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from metrpo.errors import MetrpoError
 from metrpo.run.files import temporary_path
 from metrpo.world import env_returns
 from metrpo.world.env_wrapper import Guarded
-from metrpo.world.opengl import INSTALL_GL, gl_library
+from metrpo.world.opengl import INSTALL_GL, gl_for_others
 
 INSTALL_EXTRA = "pip install 'metrpo[video]'"
 _GL = ("mujoco", "OpenGL", "glfw", "pyglet")
@@ -45,7 +45,7 @@ def record(make_env: Callable[..., Any], policy: Callable[[np.ndarray], np.ndarr
         raise VideoError(f"{path}: expected a file name that ends in .mp4 or .gif, got {path.suffix or 'no ending'}")
     if path.suffix == ".mp4" and not has_encoder():
         raise VideoError(f"no video encoder: {INSTALL_EXTRA}, or choose a .gif")
-    with _rendering():
+    with gl_for_others():
         frames, fps = _episode(make_env, policy, seed)
     temporary = temporary_path(path)
     try:
@@ -94,25 +94,6 @@ with mujoco.Renderer(model, 16, 16) as renderer:
 def _renders(backend: str) -> bool:
     environment = os.environ | {"MUJOCO_GL": backend}
     return subprocess.run([sys.executable, "-c", _PROBE], env=environment, capture_output=True).returncode == 0
-
-
-@contextlib.contextmanager
-def _rendering() -> Iterator[None]:
-    """Gymnasium's MuJoCo environments draw by the library that ours would take.
-
-    Where nobody says which one, they take GLFW, which fails without a display only once it is too late for another.
-    """
-    chosen = None
-    with contextlib.suppress(ValueError):  # the renderer says what is wrong with MUJOCO_GL
-        chosen = None if os.environ.get("MUJOCO_GL") else gl_library()
-    if chosen is None:
-        yield
-        return
-    os.environ["MUJOCO_GL"] = chosen
-    try:
-        yield
-    finally:
-        del os.environ["MUJOCO_GL"]
 
 
 def _episode(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import os
 import sys
+from collections.abc import Iterator
 from ctypes.util import find_library
 
 INSTALL_GL = "apt install libosmesa6 (software) or libegl1 (GPU), then set MUJOCO_GL=osmesa or MUJOCO_GL=egl"
@@ -47,3 +49,23 @@ def gl_library() -> str | None:
     if chosen or sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         return chosen if chosen in ("egl", "osmesa") else None
     return "osmesa" if find_library("OSMesa") else "egl" if find_library("EGL") else None
+
+
+@contextlib.contextmanager
+def gl_for_others() -> Iterator[None]:
+    """Gymnasium's and dm_control's environments draw by the library that ours would take.
+
+    Where nobody says which one, they take GLFW, which fails without a display only once it is too late for another.
+    dm_control settles for one as it is imported.
+    """
+    chosen = None
+    with contextlib.suppress(ValueError):  # the renderer says what is wrong with MUJOCO_GL
+        chosen = None if os.environ.get("MUJOCO_GL") else gl_library()
+    if chosen is None:
+        yield
+        return
+    os.environ["MUJOCO_GL"] = chosen
+    try:
+        yield
+    finally:
+        del os.environ["MUJOCO_GL"]

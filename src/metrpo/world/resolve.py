@@ -21,6 +21,7 @@ from metrpo.errors import MissingTaskError, TaskError
 from metrpo.types import EndFormula, RewardFormula
 from metrpo.world import env_returns, interface
 from metrpo.world.env_wrapper import Guarded
+from metrpo.world.opengl import gl_for_others
 from metrpo.world.size_limits import require_horizon
 from metrpo.world.task import Task
 
@@ -253,7 +254,10 @@ def _on_path(folder: Path) -> Iterator[None]:
 
 def _register_dm_control() -> None:
     try:
-        shimmy = importlib.import_module("shimmy")
-    except ImportError as error:
+        with gl_for_others():
+            shimmy = importlib.import_module("shimmy")
+    except ModuleNotFoundError as error:
         raise TaskError("dm_control tasks need Shimmy: pip install 'metrpo[dm-control]'") from error
+    except Exception as error:  # dm_control loads OpenGL as it is imported
+        raise TaskError(f"dm_control cannot be imported: {type(error).__name__}: {error}") from error
     gymnasium.register_envs(shimmy)
