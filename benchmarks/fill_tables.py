@@ -1,8 +1,8 @@
 """Puts the tables of results into the pages: `python benchmarks/fill_tables.py`, after `metrpo reproduce`.
 
 Between `<!-- NAME -->` and `<!-- end -->` of docs/reproduction.md goes `results/laptop/figures/NAME.md`. Elsewhere
-the table under `<!-- runs: PATTERN ... -->` is what `summarise.py` makes of these folders of results/; that of MBBL's
-tasks and the README's are made anew too.
+the table under `<!-- runs: PATTERN ... -->` is what `summarise.py` makes of these folders of results/; those beside
+published returns (`mbbl_table.py`, `long_table.py`) and the README's are made anew too.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 
 import headline
+import long_table
 import mbbl_table
 from summarise import ROOT, table
 
@@ -37,9 +38,11 @@ def with_runs(page: str) -> str:
     return re.sub(r"(<!-- runs: (.+) -->\n\n)(\|.*\n)+", runs, page)
 
 
-def with_mbbl(page: str) -> str:
-    """The page with the table of MBBL's tasks made anew."""
-    return re.sub(r"(<!-- mbbl -->\n).*?(<!-- end -->)", rf"\1{mbbl_table.table()}\2", page, flags=re.DOTALL)
+def with_published(page: str) -> str:
+    """The page with the tables beside published returns (MBBL, and long episodes of Gymnasium) made anew."""
+    for name, made in (("mbbl", mbbl_table.table), ("long", long_table.table)):
+        page = re.sub(rf"(<!-- {name} -->\n).*?(<!-- end -->)", rf"\1{made()}\2", page, flags=re.DOTALL)
+    return page
 
 
 def with_headline(page: str) -> str:
@@ -53,4 +56,4 @@ if __name__ == "__main__":
     README.write_text(with_headline(README.read_text()))
     PAGE.write_text(with_figures(PAGE.read_text()))
     for path in PAGES:
-        path.write_text(with_mbbl(with_runs(path.read_text())))
+        path.write_text(with_published(with_runs(path.read_text())))
