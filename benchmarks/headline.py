@@ -53,7 +53,7 @@ def _row(task: str) -> tuple[str, ...] | None:
     last = [read_metrics(path)[-1] for path in found[folder]]
     returns = [float(row["return_real"] or np.nan) for row in last]
     file = ROOT / "ceilings" / f"{task}.json"
-    ceiling = f"{json.loads(file.read_text())['best']['mean']:.0f}" if file.exists() else "not searched"
+    ceiling = f"{json.loads(file.read_text())['best']['mean']:.1f}" if file.exists() else "not searched"
     return (
         task,
         systems[folder],
