@@ -1,4 +1,4 @@
-"""The table of the README: returns beside what no skill earns and, where it was searched, the ceiling.
+"""The table of the README: returns beside what no skill earns and, where it was tried, what open-loop search finds.
 
 `python benchmarks/fill_tables.py` puts it into the README, from results/fast, results/laptop or results/own,
 results/yardsticks.json (`yardsticks.py`) and results/ceilings (`ceiling.py`).
@@ -32,7 +32,7 @@ HEADER = (
     "worst seed",
     "doing nothing",
     "random actions",
-    "ceiling",
+    "search",
     "runs",
 )
 
