@@ -3,8 +3,7 @@
 Ours: the last real return up to 50,000 and up to 100,000 real steps, of every run in `results/own/TASK/actor-critic`
 and, where there is one, `.../learned-reward`; SAC as Stable-Baselines3 has it, on the same machine, in
 `results/sac/TASK` (`soft_actor_critic.py`). Published: `results/published/gymnasium.csv`, on version 4 of the tasks,
-from the result files of 4kubo/erl_lib (DHMBPO, MACURA, MBPO), facebookresearch/MRQ (TD-MPC2) and
-dojeon-ai/SimbaV2 (SimbaV2, SAC).
+from the result files of 4kubo/erl_lib, dojeon-ai/SimbaV2 and facebookresearch/MRQ on GitHub.
 """
 
 from __future__ import annotations

@@ -72,6 +72,7 @@ def test_the_tables_are_those_that_the_metrics_give(monkeypatch):
         assert fill["with_runs"](text) == text, f"{page}: run: python benchmarks/fill_tables.py"
     assert fill["headline"].table() in (ROOT / "README.md").read_text(), "run: python benchmarks/fill_tables.py"
     assert fill["mbbl_table"].table() in (ROOT / "docs" / "environments.md").read_text()
+    assert fill["long_table"].table() in (ROOT / "docs" / "actor-critic.md").read_text()
 
 
 @pytest.mark.parametrize("name", FIGURES)
