@@ -270,6 +270,33 @@ def test_the_camera_follows_a_robot_unless_another_is_asked_for(name, asked, cam
     assert mujoco.mj_id2name(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, renderer.camera_id) == camera
 
 
+@pytest.mark.parametrize("name", ["HalfCheetah-v5", "mbbl/HalfCheetah", "Ant-v5"])
+def test_whoever_is_followed_never_leaves_the_floor_and_moves_as_ever(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(video, "FRAMES", 1)
+    plain = get_task(name).make_env()
+    env = get_task(name).make_env(render_mode="rgb_array")
+    env.render = lambda: np.zeros((16, 16, 3), np.uint8)
+    record(lambda render_mode: env, lambda state: np.zeros(env.action_space.shape), tmp_path / "video.gif")
+    inner, untouched = (getattr(x, "inner", x.unwrapped) for x in (env, plain))
+    planes = inner.model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+    assert planes.any()
+    assert not inner.model.geom_size[planes, :2].any()
+    # As many tiles a metre as before.
+    size, material = untouched.model.geom_size[planes][0, :2], untouched.model.geom_matid[planes][0]
+    np.testing.assert_allclose(
+        inner.model.mat_texrepeat[material] * 2 * size, untouched.model.mat_texrepeat[material], rtol=1e-6
+    )
+    env, plain = get_task(name).make_env(render_mode="rgb_array"), get_task(name).make_env()
+    video._follow(env)
+    states = []
+    for each in (env, plain):
+        each.reset(seed=0)
+        data = getattr(each, "inner", each.unwrapped).data
+        data.qpos[0] = 1_000.0
+        states.append([each.step(np.full(each.action_space.shape, 0.5, np.float32))[0] for _ in range(40)])
+    np.testing.assert_array_equal(*states)
+
+
 def test_an_error_of_the_environment_passes_whatever_draws_it(tmp_path, monkeypatch):
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     monkeypatch.setattr(opengl, "gl_library", lambda: "osmesa")

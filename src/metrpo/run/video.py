@@ -119,9 +119,9 @@ def _episode(
 
 
 def _follow(env: Any) -> None:
-    """Lets the model's camera "track" draw, if it has one and nobody asked for another.
+    """Lets the model's camera "track" draw, if it has one and nobody asked for another, and a floor without end.
 
-    The camera of Gymnasium's MuJoCo tasks stands still, and whatever runs leaves the picture.
+    The camera of Gymnasium's MuJoCo tasks stands still, so that runners leave the picture, and later the floor.
     """
     inner = env.inner if isinstance(env, Guarded) else getattr(env, "unwrapped", env)
     renderer: Any = getattr(inner, "mujoco_renderer", None)
@@ -132,7 +132,17 @@ def _follow(env: Any) -> None:
         return
     import mujoco  # only where the environment is of MuJoCo
 
-    renderer.camera_id = mujoco.mj_name2id(renderer.model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+    model = renderer.model
+    renderer.camera_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
+    if renderer.camera_id == -1:
+        return
+    # Planes hold whatever stands on them without end, but are drawn only as far as their size says; 0 is without end.
+    for floor in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
+        material, size = model.geom_matid[floor], model.geom_size[floor, :2].copy()
+        if model.geom_bodyid[floor] == 0 and size.all():
+            model.geom_size[floor, :2] = 0
+            if material >= 0 and not model.mat_texuniform[material]:
+                model.mat_texrepeat[material] /= 2 * size  # a whole plane's repetitions, to those of a metre
 
 
 def _frame(env: Any) -> np.ndarray:
