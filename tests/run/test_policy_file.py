@@ -70,6 +70,13 @@ def test_other_shapes_say_what_was_expected(loaded, shape):
     assert str(list(shape)) in str(error.value)
 
 
+def test_another_shape_says_what_an_observation_is_made_of(policy, tmp_path):
+    interface = Interface(((1, "global x, added by metrpo"), (S - 1, "as Gymnasium makes it")), (-1.0,) * A, (1.0,) * A)
+    save_policy(tmp_path, policy, "Swimmer", Learned(3, 900, 12.5), interface)
+    with pytest.raises(ValueError, match=r"\(1: global x, added by metrpo; 4: as Gymnasium makes it\), got \[4\]"):
+        load_policy(tmp_path)(np.zeros(S - 1))
+
+
 def test_the_json_beside_it_describes_it(loaded, tmp_path):
     beside = json.loads((tmp_path / "policy.json").read_text())
     assert beside["sha256"] == hashlib.sha256((tmp_path / "policy.npz").read_bytes()).hexdigest()

@@ -123,7 +123,9 @@ class LoadedPolicy:
     def _state(self, observation: Any) -> np.ndarray:
         """The state [S] or [B, S] that an observation makes with what came before."""
         layout = self.info.layout
-        observed = _as_batch("observation", observation, layout.observation_size, self._precision)
+        observed = _as_batch(
+            "observation", observation, layout.observation_size, self._precision, self.info.observation
+        )
         before, action = self._last.get("state"), self._last.get("taken")
         if before is None:
             return layout.begin(observed)
@@ -145,7 +147,8 @@ class LoadedPolicy:
 
         Raises `ValueError` when the state has another shape, or is not finite in float32.
         """
-        hidden = _as_batch("observation", state, self.info.layout.state_size, self._precision)
+        parts = self.info.observation if self.info.history == 1 else None
+        hidden = _as_batch("observation", state, self.info.layout.state_size, self._precision, parts)
         if self.origin is not None:
             with np.errstate(over="ignore"):
                 hidden = (hidden - self.origin).astype(np.float32)
@@ -170,12 +173,15 @@ class LoadedPolicy:
         return scaled.astype(np.float32 if exact else np.float64)
 
 
-def _as_batch(name: str, value: Any, size: int, kind: type) -> np.ndarray:
-    """Raises `ValueError` unless it is of shape [size] or [B, size]."""
+def _as_batch(
+    name: str, value: Any, size: int, kind: type, parts: tuple[tuple[int, str], ...] | None = None
+) -> np.ndarray:
+    """Raises `ValueError` unless it is of shape [size] or [B, size]; the message says of which `parts`."""
     with np.errstate(over="ignore"):
         batch: np.ndarray = np.asarray(value, dtype=kind)
     if batch.ndim not in (1, 2) or batch.shape[-1] != size:
-        raise ValueError(f"{name}: expected shape [{size}] or [B, {size}], got {list(batch.shape)}")
+        made_of = f" ({'; '.join(f'{count}: {what}' for count, what in parts)})" if parts else ""
+        raise ValueError(f"{name}: expected shape [{size}] or [B, {size}]{made_of}, got {list(batch.shape)}")
     return batch
 
 

@@ -100,7 +100,8 @@ def _as_batch(name, value, size, kind):
     with np.errstate(over="ignore"):
         batch = np.asarray(value, dtype=kind)
     if batch.ndim not in (1, 2) or batch.shape[-1] != size:
-        raise ValueError(f"{name}: expected shape [{size}] or [B, {size}], got {list(batch.shape)}")
+        parts = "; this file begins with its parts" if name == "observation" else ""
+        raise ValueError(f"{name}: expected shape [{size}] or [B, {size}], got {list(batch.shape)}{parts}")
     return batch
 
 
