@@ -14,27 +14,30 @@ from pathlib import Path
 import numpy as np
 from summarise import ROOT, no_skill
 
+from metrpo import read_metrics
 from metrpo.report.tables import markdown
 
 TASKS = ("HalfCheetah-v5", "Hopper-v5", "Ant-v5")
 STEPS = (50_000, 100_000)
-OURS = {"actor-critic": "own/{}/actor-critic", "actor-critic, reward learned": "own/{}/learned-reward", "SAC": "sac/{}"}
-"""Names of rows, and the folder of results/ that holds a task's seeds."""
+OURS = {
+    "metrpo, actor-critic": "own/{}/actor-critic",
+    "metrpo, actor-critic, reward learned": "own/{}/learned-reward",
+    "SAC, Stable-Baselines3": "sac/{}",
+}
+"""Rows, and the folder of results/ that holds a task's seeds."""
 
 
 def table() -> str:
     """The table as Markdown: our rows, what no skill earns, then the published ones."""
     columns = [(task, steps) for task in TASKS for steps in STEPS]
     head = ["", *(f"{task.removesuffix('-v5')}, {steps:,}" for task, steps in columns)]
-    mine = [
-        [f"metrpo, {name}" if name != "SAC" else "SAC, Stable-Baselines3", *(_ours(folder, *x) for x in columns)]
-        for name, folder in OURS.items()
-    ]
+    mine = [[name, *(_ours(folder, *column) for column in columns)] for name, folder in OURS.items()]
     mine = [row for row in mine if any(cell != "-" for cell in row[1:])]
     still = [[way, *(no_skill(task)[i] for task, _ in columns)] for i, way in enumerate(("doing nothing", "random"))]
     with (ROOT / "published" / "gymnasium.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    published = [[f"{name} (v4)", *(_published(rows, name, *x) for x in columns)] for name in _names(rows)]
+    methods = dict.fromkeys(row["method"] for row in rows)
+    published = [[f"{name} (v4)", *(_published(rows, name, *column) for column in columns)] for name in methods]
     return markdown(head, [*mine, *still, *published])
 
 
@@ -49,15 +52,9 @@ def _ours(folder: str, task: str, steps: int) -> str:
 
 
 def _return_at(metrics: Path, steps: int) -> float | None:
-    """The last return up to so many real steps; None where the run ended more than an episode before."""
-    with metrics.open(newline="") as file:
-        rows = [(int(row["real_steps"]), float(row["return_real"])) for row in csv.DictReader(file)]
-    before = [row for row in rows if row[0] <= steps]
-    return before[-1][1] if before and before[-1][0] > steps - 2_000 else None
-
-
-def _names(rows: list[dict[str, str]]) -> list[str]:
-    return list(dict.fromkeys(row["method"] for row in rows))
+    """The last return up to so many real steps; None where the run ended more than 2,000 before: two episodes."""
+    last = [row for row in read_metrics(metrics) if (row["real_steps"] or 0) <= steps][-1]
+    return last["return_real"] if (last["real_steps"] or 0) > steps - 2_000 else None
 
 
 def _published(rows: list[dict[str, str]], method: str, task: str, steps: int) -> str:

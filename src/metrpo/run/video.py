@@ -134,15 +134,23 @@ def _follow(env: Any) -> None:
 
     model = renderer.model
     renderer.camera_id = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, "track")
-    if renderer.camera_id == -1:
-        return
-    # Planes hold whatever stands on them without end, but are drawn only as far as their size says; 0 is without end.
+    if renderer.camera_id != -1:
+        _without_end(model)
+
+
+def _without_end(model: Any) -> None:
+    """The world's planes hold whatever stands on them without end, but are drawn only as far as their size says.
+
+    A size of 0 is drawn without end, with as many tiles a metre as before.
+    """
+    import mujoco
+
     for floor in np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE):
         material, size = model.geom_matid[floor], model.geom_size[floor, :2].copy()
         if model.geom_bodyid[floor] == 0 and size.all():
             model.geom_size[floor, :2] = 0
             if material >= 0 and not model.mat_texuniform[material]:
-                model.mat_texrepeat[material] /= 2 * size  # a whole plane's repetitions, to those of a metre
+                model.mat_texrepeat[material] /= 2 * size
 
 
 def _frame(env: Any) -> np.ndarray:
