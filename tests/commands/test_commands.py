@@ -47,6 +47,10 @@ def a_state(iteration: int) -> State:
     return State(iteration, 200 * iteration, Weights(layers, np.zeros(2, np.float32)))
 
 
+EARNED: dict[int, float] = {}
+"""Iteration -> its return, where that is not 1.5."""
+
+
 def train(config: Config, run_dir: Path, progress: Any, callbacks: Any = ()) -> None:
     """Stands in for training.train: learns nothing, but keeps its promises to the disk."""
     with RunDirectory(run_dir, config) as run:
@@ -57,7 +61,7 @@ def train(config: Config, run_dir: Path, progress: Any, callbacks: Any = ()) -> 
             row = {
                 "iteration": state.iteration,
                 "real_steps": state.real_steps,
-                "return_real": 1.5,
+                "return_real": EARNED.get(state.iteration, 1.5),
                 "return_real_std": 0.5,
             }
             progress.end(run.save(state, row))
@@ -97,6 +101,13 @@ def test_train_ends_by_naming_its_files(capsys):
     ):
         assert text in out
     assert load_policy(base).info.task == "Swimmer"
+    assert "best" not in out, "it is the last one"
+
+
+def test_train_names_the_best_policy_where_it_is_another(capsys, monkeypatch):
+    monkeypatch.setitem(EARNED, 1, 7.25)
+    assert run("train", "swimmer", "--iterations", "2", "--run-dir", "a") == 0
+    assert "  best     a/best/policy.npz (return 7.2 after 200 real steps)" in capsys.readouterr().out
 
 
 def test_the_same_command_goes_on_and_a_larger_budget_too(capsys):

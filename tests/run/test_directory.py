@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import logging
+import math
 import os
 import subprocess
 import sys
@@ -67,6 +68,8 @@ def test_a_run_leaves_what_a_person_can_read(tmp_path):
         "metrics.csv",
         "policy.npz",
         "policy.json",
+        "best/policy.npz",
+        "best/policy.json",
         "checkpoints/iteration-00004.npz",
         "checkpoints/iteration-00005.npz",
     }
@@ -286,6 +289,44 @@ def test_a_finished_run_rewrites_what_is_missing_or_damaged(tmp_path, monkeypatc
     assert contents() == before
 
 
+@pytest.mark.parametrize(
+    ("returns", "best"),
+    [
+        ([1.0, 3.0, 2.0], 2),
+        ([1.0, 3.0, 3.0], 3),  # of equals the newest, which knows more
+        ([math.nan, -2.0, math.nan], 2),
+        ([None, -2.0, -1.0], 3),
+        ([math.nan, math.nan], None),  # nobody can evaluate it
+    ],
+)
+def test_the_policy_that_earned_most_stays(tmp_path, returns, best):
+    """After `return-fell`, the report advises to use it."""
+    with RunDirectory(tmp_path, CONFIG) as run:
+        run.load(a_state())
+        for i, value in enumerate(returns, 1):
+            run.save(a_state(i), a_row(i) | {"return_real": value})
+    with RunDirectory(tmp_path, CONFIG) as run:  # publishes the last one again
+        run.load(a_state())
+    assert load_policy(tmp_path).info.iteration == len(returns)
+    if best is None:
+        assert not (tmp_path / "best").exists()
+        return
+    kept = load_policy(tmp_path / "best")
+    assert (kept.info.iteration, kept.info.return_real) == (best, returns[best - 1])
+    np.testing.assert_array_equal(kept.layers[0][0], a_state(best).policy.layers[0][0])
+
+
+def test_killed_before_the_best_policy_was_kept(tmp_path, monkeypatch):
+    train(tmp_path, until=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(RunDirectory, "_publish", lambda *_, **__: None)
+        train(tmp_path, until=2)
+    with RunDirectory(tmp_path, CONFIG) as run:
+        run.load(a_state())
+        run.save(a_state(3), a_row(3) | {"return_real": -1.0})
+    assert load_policy(tmp_path / "best").info.iteration == 2
+
+
 def test_a_curve_from_before_the_checkpoint_is_drawn_anew(tmp_path, monkeypatch):
     """It could not be drawn then, though all else was written."""
     monkeypatch.setattr(derived_files, "draw_curve", lambda rows, path, *_: path.write_text(f"{len(rows)} rows"))
@@ -337,7 +378,7 @@ def cut(path: Path) -> None:
         ),
         ("run.json", lambda p: p.write_text("{"), "run.json is damaged"),
         ("run.json", lambda p: p.write_text("[1]"), "run.json is damaged"),
-        ("run.json", lambda p: p.unlink(), "is no run directory: expected .* got checkpoints, config.json"),
+        ("run.json", lambda p: p.unlink(), "is no run directory: expected .* got best, checkpoints, config.json"),
         ("config.json", cut, "config.json is damaged"),
         ("config.json", lambda p: p.unlink(), "config.json is missing"),
         ("config.json", lambda p: p.write_bytes(b"\xff"), "config.json is damaged"),

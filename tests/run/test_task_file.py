@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import json
 import re
+import shutil
 import sys
 import textwrap
 from pathlib import Path
@@ -144,6 +145,9 @@ def test_a_run_is_evaluated_elsewhere_and_after_its_file_moved(tmp_path, monkeyp
     assert evaluated(capsys, "../run") == (0, "mine.py:make")
     monkeypatch.chdir(tmp_path)
     assert evaluated(capsys, "run") == (0, "mine.py:make")
+    shutil.copytree("run", "run/best", ignore=shutil.ignore_patterns("run.json"))
+    for place in ("run/best", "run/policy.npz", "run/best/policy.npz"):
+        assert evaluated(capsys, place) == (0, "mine.py:make")
     (tmp_path / "there").rename(tmp_path / "moved")
     monkeypatch.setattr(resolve, "_PLACES", {})
     code, said = evaluated(capsys, "run")

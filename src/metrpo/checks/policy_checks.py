@@ -52,7 +52,8 @@ def return_fell(rows: Sequence[Row], config: Config) -> Concern | None:
         since,
         f"Return {short(pairs[-1])}, {after}",
         f"the policy has unlearned ({models})",
-        f"use an earlier policy, or try more models (ensemble.members), smaller steps ({size}), more real steps",
+        "use the policy in the run's folder best/, or try more models (ensemble.members), "
+        f"smaller steps ({size}), more real steps",
     )
 
 

@@ -83,6 +83,8 @@ def say_outcome(run_dir: Path, video: bool) -> None:
     files = {"curve": "curve.png", "metrics": "metrics.csv", "policy": "policy.npz"}
     for what, name in files.items():
         print(f"  {what:<8} {run_dir / name}", flush=True)
+    if better := _better_before(run_dir, last["iteration"]):
+        print(f"  {'best':<8} {better}", flush=True)
     if not video:
         return
     print(f"  {'video':<8} ", end="", flush=True)  # it takes a while
@@ -91,6 +93,19 @@ def say_outcome(run_dir: Path, video: bool) -> None:
     except Exception as error:  # the run is complete without it
         said = f": {error}" if isinstance(error, VideoError) else f" ({type(error).__name__}: {error})"
         print(f"none{said}; --no-video makes none")
+
+
+def _better_before(run_dir: Path, iteration: int | float | None) -> str | None:
+    """The policy whose evaluation earned most, and how much; None where it is that of the last `iteration`."""
+    from metrpo.console.result_lines import rounded
+    from metrpo.run.files import BEST
+    from metrpo.run.policy_file import FILE, load_policy
+
+    with suppress(MetrpoError):  # older runs have none, nor has a task that nobody can evaluate
+        best = load_policy(run_dir / BEST).info
+        if best.iteration != iteration:
+            return f"{run_dir / BEST / FILE} (return {rounded(best.return_real)} after {best.real_steps:,} real steps)"
+    return None
 
 
 def _video_of(run_dir: Path) -> Path | None:

@@ -8,15 +8,21 @@ from pathlib import Path
 from typing import Any
 
 from metrpo.errors import RunDirectoryError
-from metrpo.run.files import atomic_write
+from metrpo.run.files import BEST, atomic_write
 from metrpo.safe_load import json_of, text_of
 
 _FILE = "run.json"
 
 
 def about(run_dir: str | Path) -> dict[str, Any]:
-    """All that run.json holds; nothing where there is none. Raises `RunDirectoryError` when it is damaged."""
-    file = Path(run_dir) / _FILE
+    """All that run.json holds; nothing where there is none. A policy's file and the folder best/ lead to their run's.
+
+    Raises `RunDirectoryError` when it is damaged.
+    """
+    folder = Path(run_dir).parent if Path(run_dir).suffix == ".npz" else Path(run_dir)
+    file = folder / _FILE
+    if folder.name == BEST and not file.is_file():
+        file = folder.with_name(_FILE)
     if not file.is_file():  # a policy by itself
         return {}
     found = json_of(text_of(file, RunDirectoryError), f"{file} is damaged", RunDirectoryError)

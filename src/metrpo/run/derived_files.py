@@ -1,4 +1,4 @@
-"""What a run directory derives from its newest checkpoint: policy, curve, events, diagnostics and metrics."""
+"""What a run directory derives from its newest checkpoint: policies, curve, events, diagnostics and metrics."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from metrpo.config import Config
 from metrpo.run import yardstick_record
 from metrpo.run.curve import draw_curve
-from metrpo.run.files import atomic_write
+from metrpo.run.files import BEST, atomic_write
 from metrpo.run.metrics import Events, Row, details, overview, to_csv
 from metrpo.run.newest_checkpoint import Saved
 from metrpo.run.policy_file import Learned, save_policy
@@ -53,7 +53,8 @@ class DerivedFiles:
         result = result if result is not None and math.isfinite(result) else None
         learned = Learned(state.iteration, state.real_steps, result)
         origin = getattr(state, "origin", None)  # baselines have none
-        save_policy(self._run_dir, state.policy, self._config.task, learned, self._interface, origin, self._config)
+        for folder in (self._run_dir, self._run_dir / BEST)[: 2 if _is_best(rows) else 1]:
+            save_policy(folder, state.policy, self._config.task, learned, self._interface, origin, self._config)
 
     def _draw_curve(self, rows: Sequence[Row]) -> None:
         title = f"{self._config.task}, {self._config.system}, {self._config.preset}, seed {self._config.seed}"
@@ -74,6 +75,12 @@ class DerivedFiles:
         except Exception as error:
             self._failed.add(what)
             _log.warning("no %s any more (%s: %s); training continues", what, type(error).__name__, error)
+
+
+def _is_best(rows: Sequence[Row]) -> bool:
+    """Whether no policy has earned more than the newest."""
+    returns = [value for row in rows if (value := row.get("return_real")) is not None and math.isfinite(value)]
+    return bool(returns) and rows[-1].get("return_real") == max(returns)
 
 
 def _within(seconds: float, act: Callable[[], None]) -> None:

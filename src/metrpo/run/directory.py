@@ -4,7 +4,7 @@
     DIR/config.json    every setting               DIR/diagnostics.csv  the same for each model and state dimension
     DIR/checkpoints/   the newest two states       DIR/policy.npz       the policy (policy.json says what it is)
     DIR/events/        TensorBoard                 DIR/curve.png        the learning curve
-    DIR/video.mp4      the final policy at work
+    DIR/video.mp4      the final policy at work      DIR/best/            the policy that earned most when evaluated
     DIR/episodes/      real episodes that the state has not learned from (see `metrpo.run.episodes`)
 
 The newest checkpoint is the run: it holds the state and all rows. Everything else is derived from it, written after it

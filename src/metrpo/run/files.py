@@ -28,6 +28,8 @@ from metrpo.safe_load import LARGEST_FILE, LARGEST_TEXT, arrays_of, brief, json_
 
 FORMAT = 1
 """Raised whenever a file of a run directory changes its meaning; other formats are refused by name."""
+BEST = "best"
+"""Folder in a run directory: the policy that earned most when it was evaluated."""
 
 _META = "meta.json"
 _DIGEST_SIZE = 64
