@@ -150,6 +150,35 @@ def test_all_that_updates_hand_on_goes_on_in_the_next_iteration(small):
         assert not np.array_equal(before, after)
 
 
+def test_by_a_vote_the_policy_waits_and_the_learner_goes_on(small, monkeypatch):
+    guarded = override(SMALL, {"validate.rule": "ensemble", "validate.threshold": 1.0})
+    votes = iter(([0.0, 0.0], [1.0, 1.0], [1.0, 1.0], [2.0, 0.0], [1.0, 1.0], [1.0, 2.0], [1.0, 1.0], [2.0, 2.0]))
+    seen = []
+
+    def values(config, simulator, policies, starts, key):
+        seen.append(policies)
+        return [np.array(next(votes)), np.array(next(votes))]
+
+    monkeypatch.setattr(actor_critic_search, "_values", values)
+    done = run(guarded)
+    assert [row["accepted_updates"] for row in done.rows] == [20, 0, 0, 10]
+    assert [row["fraction_improved"] for row in done.rows] == [1.0, 0.5, 0.5, 1.0]
+    assert [row["return_imagined"] for row in done.rows] == [1.0, 1.0, 1.0, 2.0], "of the policy that is handed over"
+    first = done.states[1].policy
+    assert equal(first, done.states[2].policy)
+    assert equal(first, done.states[3].policy)
+    assert not equal(first, done.states[4].policy)
+    assert all(equal(old, first) for old, _ in seen[1:]), "each is held against the one that was accepted last"
+    for voted, unvoted in zip(done.states, small.states, strict=True):
+        assert equal(voted.baseline, unvoted.baseline), "the learner is the same with and without a vote"
+
+
+@pytest.mark.parametrize("rule", ["real", "trpo_mean"])
+def test_a_rule_that_asks_more_than_the_models_is_refused(rule):
+    with pytest.raises(ConfigError, match=f"expected ensemble, one_model or no_early with .* got {rule}"):
+        training.init(override(SMALL, {"validate.rule": rule}))
+
+
 def test_a_run_that_was_resumed_is_the_run_that_never_stopped(tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     train(override(SMALL, {"iterations": 3}), whole)
@@ -171,7 +200,10 @@ def test_its_steps_one_at_a_time_are_the_loop_byte_for_byte(tmp_path):
         assert (whole / name).read_bytes() == (steps / name).read_bytes(), name
 
 
-@pytest.mark.parametrize("settings", [{"learn_reward": True}, {"history": 2}, {"actor_critic.horizon": 0}])
+@pytest.mark.parametrize(
+    "settings",
+    [{"learn_reward": True}, {"history": 2}, {"actor_critic.horizon": 0}, {"validate.rule": "one_model"}],
+)
 def test_it_learns_rewards_sees_the_past_and_does_without_imagined_steps(settings, tmp_path):
     train(override(SMALL, {"iterations": 2, **settings}), tmp_path)
     row = read_metrics(tmp_path / "metrics.csv")[-1]

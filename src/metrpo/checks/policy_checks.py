@@ -229,21 +229,22 @@ def nothing_accepted(rows: Sequence[Row], config: Config) -> Concern | None:
         since, measured = int(iteration_at(rows, -LAST)), f"No policy update accepted in {count} of {LAST} iterations"
     else:
         return None
+    patience = "" if config.by_critics else ", a longer validate.patience"
     return Concern(
         "nothing-accepted",
         "note",
         since,
         measured,
         "the policy stays the same: the models see no improvement, or do not agree on one",
-        "if the return is good, the run has converged; if not, try more real steps, a longer validate.patience or a "
-        "lower validate.threshold",
+        f"if the return is good, the run has converged; if not, try more real steps{patience} or a lower "
+        "validate.threshold",
     )
 
 
 def never_stopped(rows: Sequence[Row], config: Config) -> Concern | None:
     """Validation never stops the policy, so nothing guards it against the models' errors."""
-    if config.method != "model-based" or config.validate.rule == "no_early":
-        return None
+    if config.method != "model-based" or config.by_critics or config.validate.rule == "no_early":
+        return None  # the critics' vote stops nothing
     since = since_when(rows, column(rows, "updates") >= config.validate.max_updates)
     if since is None or (count := int(iteration_at(rows, -1)) - since + 1) < NEVER_STOPPED:
         return None

@@ -8,6 +8,9 @@ from metrpo.errors import ConfigError
 _LIMITED = ("model-based", "trpo")
 """Methods whose real steps `world.collection` plays, and that learn from actions as executed."""
 
+_NO_VOTES = ("real", "trpo_mean")
+"""Rules that ask more than the models' values."""
+
 
 def require_consistent(config: Config) -> None:
     """Raises `ConfigError` for settings that contradict each other, whatever the task."""
@@ -26,4 +29,9 @@ def require_consistent(config: Config) -> None:
         got = config.advantage.discount
         raise ConfigError(
             f"advantage.discount: expected less than 1 with the improver actor-critic (0.995, say), got {got}"
+        )
+    if config.by_critics and config.validate.rule in _NO_VOTES:
+        raise ConfigError(
+            "validate.rule: expected ensemble, one_model or no_early with the improver actor-critic, got "
+            f"{config.validate.rule}"
         )

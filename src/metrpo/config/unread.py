@@ -28,7 +28,7 @@ _NETWORK = Reader(
     lambda c: _ADVANTAGES.reads(c) and c.advantage.baseline == "network", 'advantage.baseline = "network"'
 )
 _LINEAR = Reader(lambda c: _ADVANTAGES.reads(c) and c.advantage.baseline == "linear", 'advantage.baseline = "linear"')
-_VOTES = Reader(lambda c: _PHASE.reads(c) and c.validate.rule != "no_early", 'any validate.rule but "no_early"')
+_VOTES = Reader(lambda c: _ENSEMBLE.reads(c) and c.validate.rule != "no_early", 'any validate.rule but "no_early"')
 
 _READERS = {
     "actor_critic": _CRITICS,
@@ -74,6 +74,7 @@ _READERS = {
     "trpo": _TRPO,
     "validate": _PHASE,
     "validate.real_episodes": _ENSEMBLE,
+    "validate.rule": _ENSEMBLE,
     "validate.starts": _ENSEMBLE,
     "validate.threshold": _VOTES,
 }

@@ -25,7 +25,7 @@ from metrpo.policy.gaussian import Policy
 from metrpo.policy.improvers import actor_critic
 from metrpo.policy.improvers.actor_critic import Learner, Steps, UpdateInfo, UpdateSettings
 from metrpo.policy.inputs import normalised
-from metrpo.policy.stopping import improved
+from metrpo.policy.stopping import RULES, Evidence, improved
 from metrpo.policy.value.critics import ValueScale, rescaled, reward_spread, scale_of
 from metrpo.policy_phase import PhaseInfo, simulator_of, values_of
 from metrpo.run.clock import Clock
@@ -44,6 +44,7 @@ _COMPARED, _MOST = 1000, 0.95
 _disagreement = jax.jit(disagreement)
 _JUDGE = 2**31 - 6
 """Derives the key of the noise in which policies are valued."""
+_NO_RETURN = np.array([math.nan])
 _NEAR = 0.99
 """Mean actions of a squashed policy beyond this saturate."""
 
@@ -85,6 +86,8 @@ def improve_policy(
 ) -> tuple[Policy, Learner, PhaseInfo]:
     """The policy after the updates of an iteration that collected `steps` real steps, the learner and what happened.
 
+    Where the models vote (`validate.rule`), it is the policy that they accepted last; the learner goes on in any case.
+
     `state` holds the dataset that the ensemble was fitted to.
     """
     iteration, dataset, settings = state.iteration + 1, state.dataset, UpdateSettings.of(config)
@@ -113,24 +116,37 @@ def improve_policy(
     learner = jax.device_get(learner)
     happened = jax.tree.map(lambda *xs: np.concatenate(xs), *infos)
     seen = dataset.train.states[-_LOOKED_AT:]
-    policies = [squashed.mean_policy(x.actor, inputs, seen) for x in (before, learner)]
+    old, new = (squashed.mean_policy(x.actor, inputs, seen) for x in (before, learner))
+    old = old if config.validate.rule == "no_early" else state.policy
     with clock("validate"):
-        values = _values(config, simulator, policies, dataset.starts, jax.random.fold_in(key, _JUDGE))
+        values = _values(config, simulator, [old, new], dataset.starts, jax.random.fold_in(key, _JUDGE))
     distance = squashed.kl(squashed.on_host(before.actor), learner.actor, normalised(inputs, seen))
-    more = _columns(happened[0], learner, policies[1], seen)
-    return policies[1], learner, _phase_info(happened, values, distance, more)
+    more = _columns(happened[0], learner, new, seen)
+    accepted = _is_accepted(config, *values)
+    return new if accepted else old, learner, _phase_info(happened, values, distance, more, accepted)
+
+
+def _is_accepted(config: Config, before: np.ndarray, after: np.ndarray) -> bool:
+    """Whether the policy with values `after` [K] takes the place of the accepted one, with `before`."""
+    rule = RULES[config.validate.rule]
+    old, new = (rule.evidence(Evidence(x, _NO_RETURN, lambda: math.nan)) for x in (before, after))
+    return rule.decide(new, old, config.validate)
 
 
 def _phase_info(
-    happened: tuple[UpdateInfo, ImagineInfo], values: list[np.ndarray], distance: np.ndarray, more: dict[str, float]
+    happened: tuple[UpdateInfo, ImagineInfo],
+    values: list[np.ndarray],
+    distance: np.ndarray,
+    more: dict[str, float],
+    accepted: bool,
 ) -> PhaseInfo:
-    """Of all updates: `values` [2, K] of the policy before and after them, and its `distance` between (KL)."""
+    """Of all updates: `values` [2, K] of the policy accepted before and of the one after them; KL `distance`."""
     (made, imagined), (before, after) = happened, values
     count = len(made.accepted)
     return PhaseInfo(
-        values=after,
+        values=after if accepted else before,
         updates=count,
-        accepted_updates=count,
+        accepted_updates=count if accepted else 0,
         rejected_steps=int(np.sum(~made.accepted)),
         validations=1,
         improved=improved(after, before).astype(np.float64),
