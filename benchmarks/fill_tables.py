@@ -2,14 +2,14 @@
 
 Between `<!-- NAME -->` and `<!-- end -->` of docs/reproduction.md goes `results/laptop/figures/NAME.md`. Elsewhere
 the table under `<!-- runs: PATTERN ... -->` is what `summarise.py` makes of these folders of results/; those beside
-published returns (`mbbl_table.py`, `long_table.py`), that of `falls.py` and the README's are made anew too.
+published returns (`mbbl_table.py`, `long_table.py`), that of `drops.py` and the README's are made anew too.
 """
 
 from __future__ import annotations
 
 import re
 
-import falls
+import drops
 import headline
 import long_table
 import mbbl_table
@@ -40,8 +40,8 @@ def with_runs(page: str) -> str:
 
 
 def with_published(page: str) -> str:
-    """The page with the tables beside published returns (MBBL, long episodes of Gymnasium) and of falls made anew."""
-    for name, made in (("mbbl", mbbl_table.table), ("long", long_table.table), ("falls", falls.table)):
+    """The page with the tables beside published returns (MBBL, long episodes of Gymnasium) and of drops made anew."""
+    for name, made in (("mbbl", mbbl_table.table), ("long", long_table.table), ("drops", drops.table)):
         page = re.sub(rf"(<!-- {name} -->\n).*?(<!-- end -->)", rf"\1{made()}\2", page, flags=re.DOTALL)
     return page
 

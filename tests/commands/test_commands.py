@@ -655,3 +655,11 @@ def test_a_stopped_run_says_how_to_go_on(number, code):
     assert process.returncode == code
     kept = "a keeps every finished iteration and real episode. The same command resumes."
     assert err == f"metrpo: stopped; {kept}\n\n  metrpo train Swimmer --run-dir a\n\n"
+
+
+def test_a_damaged_best_policy_is_named_at_the_end(capsys, caplog, monkeypatch):
+    monkeypatch.setitem(EARNED, 1, 7.25)
+    assert run("train", "swimmer", "--iterations", "2", "--run-dir", "a") == 0
+    Path("a/best/policy.npz").write_bytes(b"torn")
+    assert run("train", "swimmer", "--iterations", "2", "--run-dir", "a") == 0
+    assert "a/best/policy.npz is damaged" in caplog.text + capsys.readouterr().err

@@ -5,6 +5,7 @@ Each trial damages a copy of one real run, opens it as every command does, and l
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import logging
 import os
@@ -25,10 +26,12 @@ from metrpo.presets import override, preset
 from metrpo.run import derived_files
 from metrpo.run.directory import RunDirectory, stored_config
 from metrpo.run.episodes import append_episode
+from metrpo.run.policy_file import load_policy
 
 CONFIG = override(dataclasses.replace(preset("Swimmer"), task="Probe", iterations=3), probe.BRIEF)
 NEWEST, PREVIOUS = "checkpoints/iteration-00003.npz", "checkpoints/iteration-00002.npz"
-FILES = 15
+FILES = 17
+POLICIES = ("policy.npz", "best/policy.npz")
 DERIVED = ("metrics.csv", "diagnostics.csv", "policy.npz", "policy.json", "curve.png")
 
 
@@ -208,6 +211,12 @@ def trial(real, damages):
             assert "no learning curve any more" in told
         else:
             assert path.read_bytes() == content, f"{name} was not written anew"
+    # The best policy may be older than any checkpoint.
+    sound = [(run / name).read_bytes() for run in (real.path, real.other) for name in POLICIES]
+    best = run_dir / "best" / "policy.npz"
+    with contextlib.suppress(MetrpoError):
+        load_policy(best)
+        assert best.read_bytes() in sound, "garbage was loaded"
     if "TensorBoard" not in told:
         assert len([p for p in (run_dir / "events").glob("events*") if p.stat().st_size]) == 1
 

@@ -241,7 +241,9 @@ def test_what_may_be_deleted_is_quoted_for_a_shell(tmp_path):
         train(spaced, dataclasses.replace(CONFIG, seed=CONFIG.seed + 1))
 
 
-@pytest.mark.parametrize("kept", ["episodes/run-000000.npz", "checkpoints/iteration-00001.npz.damaged", "metrics.csv"])
+@pytest.mark.parametrize(
+    "kept", ["best/policy.npz", "episodes/run-000000.npz", "checkpoints/iteration-00001.npz.damaged", "metrics.csv"]
+)
 def test_a_run_with_anything_to_lose_keeps_its_claim(tmp_path, kept):
     with RunDirectory(tmp_path, CONFIG) as run:
         run.load(a_state())

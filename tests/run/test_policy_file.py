@@ -169,3 +169,9 @@ def test_deployment_needs_neither_jax_nor_mujoco(loaded, tmp_path):
     )
     ran = subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, text=True, check=True)
     assert ran.stdout == "[]\n"
+
+
+def test_a_run_without_a_best_policy_says_why_and_where_its_last_one_is(tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(RunDirectoryError, match=rf"got a run that was never evaluated, or .* is in {tmp_path}$"):
+        load_policy(tmp_path / "best")

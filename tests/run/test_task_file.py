@@ -370,3 +370,19 @@ def test_a_file_that_moved_keeps_its_arguments(tmp_path, tilted, monkeypatch, ca
 def test_a_missing_import_is_said(tmp_path, capsys):
     assert main.main(["train", "Pendulum-v1", "--import", "nowhere_at_all"]) == 2
     assert "imports nowhere_at_all: expected a module nowhere_at_all in " in capsys.readouterr().err
+
+
+def test_a_run_directory_may_end_like_a_policys_file(tmp_path, monkeypatch, capsys):
+    write("mine.py", MAKE, horizon=5)
+    a_run(tmp_path / "run.npz", "mine.py:make")
+    assert json.loads((tmp_path / "run.npz" / "run.json").read_text())["format"] == 1, "noted besides, not instead"
+
+
+def test_from_inside_the_folder_of_the_best_policy_its_runs_file_is_found(tmp_path, monkeypatch, capsys):
+    write("there/mine.py", MAKE, horizon=5)
+    monkeypatch.chdir("there")
+    a_run(tmp_path / "run", "mine.py:make")
+    shutil.copytree(tmp_path / "run", tmp_path / "run/best", ignore=shutil.ignore_patterns("run.json"))
+    monkeypatch.chdir(tmp_path / "run" / "best")
+    forgotten(monkeypatch)
+    assert evaluated(capsys, ".") == (0, "mine.py:make")

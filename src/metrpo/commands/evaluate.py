@@ -23,7 +23,8 @@ class Evaluate:
     """
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
-    """The run directory, zoo:NAME (see: metrpo zoo), or hub:OWNER/NAME on the Hugging Face hub."""
+    """The run directory, its folder best/ (the policy that earned most), zoo:NAME (see: metrpo zoo), or hub:OWNER/NAME
+    on the Hugging Face hub."""
     episodes: int = 20
     """Number of episodes."""
     seed: int = 0

@@ -20,7 +20,8 @@ class Export:
     """
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
-    """The run directory, zoo:NAME (see: metrpo zoo), or hub:OWNER/NAME on the Hugging Face hub."""
+    """The run directory, its folder best/ (the policy that earned most), zoo:NAME (see: metrpo zoo), or hub:OWNER/NAME
+    on the Hugging Face hub."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """File to write, .py, .onnx or .npz; missing folders are created; default: policy.py in the run directory."""
 

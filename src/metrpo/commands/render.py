@@ -19,7 +19,8 @@ class Render:
     """
 
     dir: Annotated[Positional[Path], arg(metavar="DIR")]
-    """The run directory, zoo:NAME (see: metrpo zoo), or hub:OWNER/NAME on the Hugging Face hub."""
+    """The run directory, its folder best/ (the policy that earned most), zoo:NAME (see: metrpo zoo), or hub:OWNER/NAME
+    on the Hugging Face hub."""
     out: Annotated[Path | None, arg(metavar="FILE")] = None
     """File to write, .mp4 or .gif; missing folders are created; default: video.mp4 in the run directory."""
     seed: int = 0

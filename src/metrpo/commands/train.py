@@ -101,11 +101,17 @@ def _better_before(run_dir: Path, iteration: int | float | None) -> str | None:
     from metrpo.run.files import BEST
     from metrpo.run.policy_file import FILE, load_policy
 
-    with suppress(MetrpoError):  # older runs have none, nor has a task that nobody can evaluate
-        best = load_policy(run_dir / BEST).info
-        if best.iteration != iteration:
-            return f"{run_dir / BEST / FILE} (return {rounded(best.return_real)} after {best.real_steps:,} real steps)"
-    return None
+    file = run_dir / BEST / FILE
+    if not file.exists():  # an older run, or a task that nobody can evaluate
+        return None
+    try:
+        best = load_policy(file).info
+    except MetrpoError as error:
+        _log.warning("%s", error)
+        return None
+    if best.iteration == iteration:
+        return None
+    return f"{file} (return {rounded(best.return_real)} after {best.real_steps:,} real steps)"
 
 
 def _video_of(run_dir: Path) -> Path | None:

@@ -214,8 +214,8 @@ class ValidateConfig:
     rule: Literal["ensemble", "one_model", "real", "trpo_mean", "no_early"] = "ensemble"
     """What decides whether the policy improved on the last accepted one: a vote of the models (ensemble), the first
     model, the real environment (an oracle; its steps are not counted), the updates' rollouts (trpo_mean), or nothing:
-    continue to max_updates (no_early). The actor-critic learns on in any case; with ensemble or one_model its policy is
-    the one accepted last."""
+    continue to max_updates (no_early). The actor-critic knows ensemble, one_model and no_early: it never stops, and a
+    run evaluates and hands over the policy that was accepted last."""
     every: int = 5
     """Policy updates between two validations."""
     threshold: float = 0.7

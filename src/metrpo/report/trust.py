@@ -82,7 +82,7 @@ def _disagreement(run: SeenRun, x: str, x_label: str) -> str:
 
 
 def _agreement(run: SeenRun) -> str:
-    if run.config.by_critics:
+    if run.config.by_critics and run.config.validate.rule == "no_early":
         return ""  # nothing is voted on
     rows = [row for row in run.details if np.isfinite(column([row], "improved_0"))[0]]
     members = [name for name in (rows[0] if rows else ()) if re.fullmatch(r"improved_\d+", name)]

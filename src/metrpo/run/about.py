@@ -19,18 +19,22 @@ def about(run_dir: str | Path) -> dict[str, Any]:
 
     Raises `RunDirectoryError` when it is damaged.
     """
-    folder = Path(run_dir).parent if Path(run_dir).suffix == ".npz" else Path(run_dir)
+    place = Path(run_dir).absolute()
+    folder = place.parent if place.is_file() else place
     file = folder / _FILE
-    if folder.name == BEST and not file.is_file():
-        file = folder.with_name(_FILE)
-    if not file.is_file():  # a policy by itself
-        return {}
-    found = json_of(text_of(file, RunDirectoryError), f"{file} is damaged", RunDirectoryError)
-    return found if isinstance(found, dict) else {}
+    return _read(folder.with_name(_FILE) if folder.name == BEST and not file.is_file() else file)
 
 
 def note(run_dir: str | Path, fields: Mapping[str, Any]) -> None:
     """Adds `fields` to run.json, where they change it. Raises `RunDirectoryError` when it cannot be read or written."""
-    before = about(run_dir)
+    file = Path(run_dir) / _FILE
+    before = _read(file)
     if (now := {**before, **fields}) != before:
-        atomic_write(Path(run_dir) / _FILE, json.dumps(now, indent=2) + "\n")
+        atomic_write(file, json.dumps(now, indent=2) + "\n")
+
+
+def _read(file: Path) -> dict[str, Any]:
+    if not file.is_file():  # a policy by itself
+        return {}
+    found = json_of(text_of(file, RunDirectoryError), f"{file} is damaged", RunDirectoryError)
+    return found if isinstance(found, dict) else {}

@@ -4,11 +4,12 @@
     DIR/config.json    every setting               DIR/diagnostics.csv  the same for each model and state dimension
     DIR/checkpoints/   the newest two states       DIR/policy.npz       the policy (policy.json says what it is)
     DIR/events/        TensorBoard                 DIR/curve.png        the learning curve
-    DIR/video.mp4      the final policy at work      DIR/best/            the policy that earned most when evaluated
+    DIR/video.mp4      the final policy at work    DIR/best/            the policy that earned most when evaluated
     DIR/episodes/      real episodes that the state has not learned from (see `metrpo.run.episodes`)
 
-The newest checkpoint is the run: it holds the state and all rows. Everything else is derived from it, written after it
-and again when the run is resumed, so that a kill at any moment leaves nothing twice and nothing missing.
+The newest checkpoint is the run: it holds the state and all rows. Everything else is derived from it (best/ from an
+earlier one), written after it and again when the run is resumed, so that a kill at any moment leaves nothing twice and
+nothing missing.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from typing import TextIO
 from metrpo import config as configs
 from metrpo.config import Config
 from metrpo.errors import ConfigError, RunDirectoryError
-from metrpo.run.files import FORMAT, atomic_write, check_format, make_directory, metrpo_version, source_commit
+from metrpo.run.files import BEST, FORMAT, atomic_write, check_format, make_directory, metrpo_version, source_commit
 from metrpo.safe_load import json_of, text_of
 
 _log = logging.getLogger("metrpo")
@@ -134,8 +134,8 @@ def _check_or_describe(file: Path) -> None:
 
 def _has_begun(path: Path) -> bool:
     """Whether the run in `path` has anything to lose."""
-    kept = [*path.glob("checkpoints/*.npz*"), *path.glob("episodes/*.npz*")]
-    return (path / "metrics.csv").exists() or any(".tmp" not in file.name for file in kept)
+    kept = [*path.glob("checkpoints/*.npz*"), *path.glob("episodes/*.npz*"), path / "metrics.csv", path / BEST]
+    return any(file.exists() and ".tmp" not in file.name for file in kept)
 
 
 def _check_or_write_config(file: Path, config: Config, begun: bool) -> None:

@@ -16,7 +16,7 @@ from metrpo.config import Config
 from metrpo.errors import RunDirectoryError
 from metrpo.history import History
 from metrpo.policy_zoo import located
-from metrpo.run.files import FORMAT, atomic_write, inside, metrpo_version, read_arrays, write_arrays
+from metrpo.run.files import BEST, FORMAT, atomic_write, inside, metrpo_version, read_arrays, write_arrays
 from metrpo.run.loaded_policy import LoadedPolicy, PolicyInfo
 from metrpo.safe_load import brief
 
@@ -126,10 +126,15 @@ def _where_else(path: Path) -> str:
     if path.name != FILE:
         return f"expected the file {path}, got none; give a run directory, or a policy.npz"
     folder = path.parent
-    if run := inside(folder, FILE):
-        return f"expected one run's directory, got a folder of runs; name one of them, such as {run}"
+    if folder.name == BEST and (folder.parent / "config.json").exists():
+        return (
+            f"expected {path}, got a run that was never evaluated, or began under an older version and has earned no "
+            f"more since; its last policy is in {folder.parent}"
+        )
     if (folder / "config.json").exists():
         return f"expected {path}, got a run whose first iteration is not finished; resume it with its own command"
+    if run := inside(folder, FILE):
+        return f"expected one run's directory, got a folder of runs; name one of them, such as {run}"
     return f"expected {path}; train one with: metrpo train TASK --run-dir {folder}"
 
 

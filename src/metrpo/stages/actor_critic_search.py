@@ -121,9 +121,10 @@ def improve_policy(
     with clock("validate"):
         values = _values(config, simulator, [old, new], dataset.starts, jax.random.fold_in(key, _JUDGE))
     distance = squashed.kl(squashed.on_host(before.actor), learner.actor, normalised(inputs, seen))
-    more = _columns(happened[0], learner, new, seen)
     accepted = _is_accepted(config, *values)
-    return new if accepted else old, learner, _phase_info(happened, values, distance, more, accepted)
+    policy = new if accepted else old
+    more = _columns(happened[0], learner, policy, seen)
+    return policy, learner, _phase_info(happened, values, distance, more, accepted)
 
 
 def _is_accepted(config: Config, before: np.ndarray, after: np.ndarray) -> bool:
@@ -199,11 +200,10 @@ def _values(
     config: Config, simulator: Simulator, policies: list[Policy], starts: np.ndarray, key: Array
 ) -> list[np.ndarray]:
     """[K] for each of the `policies` of raw states: its mean return in every model, over whole episodes, with noise."""
-    rng = np.random.default_rng(0)  # the same starts for both; nothing is learned from these
+    rng = np.random.default_rng(0)  # the same starts and noise for both; nothing is learned from these
     chosen = starts[rng.integers(len(starts), size=config.validate.starts)]
     plain = dataclasses.replace(simulator, inputs=None)
-    keys = jax.random.split(key, len(policies))
-    return [values_of(plain, policy, chosen, key=k) for policy, k in zip(policies, keys, strict=True)]
+    return [values_of(plain, policy, chosen, key=key) for policy in policies]
 
 
 def _columns(updates: UpdateInfo, learner: Learner, policy: Policy, states: np.ndarray) -> dict[str, float]:
