@@ -21,7 +21,7 @@ FOLDERS = ("fast", "laptop", "own")
 outside the paper have the last one."""
 TASKS = (
     *("Swimmer", "Snake", "HalfCheetah", "Hopper", "HopperUpright", "Ant", "Humanoid", "HumanoidStandup"),
-    *("mbbl/Swimmer", "mbbl/HalfCheetah", "mbbl/Hopper", "mbbl/Ant"),
+    *("mbbl/Swimmer", "mbbl/HalfCheetah", "mbbl/Hopper", "mbbl/Ant", "HalfCheetah-v5"),
 )
 HEADER = (
     "task",

@@ -58,7 +58,7 @@ FAST_ALL: Overrides = {
 }
 
 FAST: dict[str, Overrides] = {
-    # Short of real steps: iterations of half the size, half the proof, and noise that lasts as long as a stroke.
+    # Short of real steps: iterations of half the size (too few for a proof), and noise that lasts as long as a stroke.
     "Swimmer": {
         "iterations": 20,
         "collect.noise_correlation": 0.9,

@@ -30,7 +30,8 @@ class Evaluate:
     seed: int = 0
     """Seed of the start states."""
     task: Annotated[str | None, arg(metavar="TASK")] = None
-    """The run's task, if its file or module has moved."""
+    """The run's task, if its file or module has moved; needed for a policy from the hub whose task is code. May also
+    name another task of the same sizes."""
     json: Switch = False
     """Print JSON."""
 

@@ -35,5 +35,6 @@ def run(command: Tasks) -> int:
     for row in rows:
         print("{name:<17} {state_size:>6} {action_size:>7} {horizon:>5}  {description}".format(**row))
     print(f"\nalso, with their reward formulas: {', '.join(KNOWN)}")
-    print("and, with a learned reward: any other Gymnasium id, module:name or path/to/file.py:name")
+    others = "other Gymnasium ids with continuous actions, module:name or path/to/file.py:name"
+    print(f"and, with a learned reward: {others}")
     return 0

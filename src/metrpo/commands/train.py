@@ -32,7 +32,8 @@ class Train(RunOptions):
         metrpo train HalfCheetah --seed 1 --real-steps 60000 --run-dir runs/cheetah
         metrpo train Pendulum-v1 --ensemble.members 10 --trpo.max-kl 0.02
 
-    Every setting starts from the task's preset; metrpo train --help-all lists them all.
+    Defaults depend on the task. Those below are Swimmer's, unless you name another: metrpo train HalfCheetah-v5 --help.
+    metrpo train --help-all lists every setting.
     """
 
     track: tuple[TrackerName, ...] = ()
