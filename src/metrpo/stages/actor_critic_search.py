@@ -200,10 +200,11 @@ def _values(
     config: Config, simulator: Simulator, policies: list[Policy], starts: np.ndarray, key: Array
 ) -> list[np.ndarray]:
     """[K] for each of the `policies` of raw states: its mean return in every model, over whole episodes, with noise."""
-    rng = np.random.default_rng(0)  # the same starts and noise for both; nothing is learned from these
+    rng = np.random.default_rng(0)  # the same starts for both; nothing is learned from these
     chosen = starts[rng.integers(len(starts), size=config.validate.starts)]
     plain = dataclasses.replace(simulator, inputs=None)
-    return [values_of(plain, policy, chosen, key=key) for policy in policies]
+    keys = jax.random.split(key, len(policies))
+    return [values_of(plain, policy, chosen, key=k) for policy, k in zip(policies, keys, strict=True)]
 
 
 def _columns(updates: UpdateInfo, learner: Learner, policy: Policy, states: np.ndarray) -> dict[str, float]:
