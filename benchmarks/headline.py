@@ -21,7 +21,8 @@ FOLDERS = ("fast", "laptop", "own")
 outside the paper have the last one."""
 TASKS = (
     *("Swimmer", "Snake", "HalfCheetah", "Hopper", "HopperUpright", "Ant", "Humanoid", "HumanoidStandup"),
-    *("mbbl/Swimmer", "mbbl/HalfCheetah", "mbbl/Hopper", "mbbl/Ant", "HalfCheetah-v5"),
+    *("mbbl/Swimmer", "mbbl/HalfCheetah", "mbbl/Hopper", "mbbl/Ant"),
+    *("HalfCheetah-v5", "Hopper-v5", "Ant-v5"),
 )
 HEADER = (
     "task",
