@@ -130,6 +130,11 @@ class Config:
         """Whether the actor-critic learns: it has settings of its own, and reads few of the others."""
         return self.improver == "actor-critic"
 
+    @property
+    def takes_votes(self) -> bool:
+        """Whether new policies are validated: all are, but the actor-critic's where nothing is asked of them."""
+        return not self.by_critics or self.validate.rule != "no_early"
+
     def __post_init__(self) -> None:
         require(bool(self.task), "task", self.task, "a task name")
         object.__setattr__(self, "env_kwargs", canonical(self.env_kwargs))

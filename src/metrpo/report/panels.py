@@ -195,8 +195,7 @@ def _of_run(s: Seen, x: str, x_label: str) -> str:
         lines = [Line(at, y, name, style, dots=False) for name, y, style in curves if np.isfinite(y).any()]
         drawn = chart("Policy updates", lines, x_label, "", axes=Axes(zero=True))
         legend = [(line.style, line.name) for line in lines]
-        voted = not run.config.by_critics or run.config.validate.rule != "no_early"
-        kept_by = "accepted by validation" if voted else "kept"
+        kept_by = "accepted by validation" if run.config.takes_votes else "kept"
         parts.append(figure("Policy updates", f"tried, {kept_by}, rejected without a move", drawn, legend))
     stages = [name for name in run.rows[0] if name.startswith("seconds_") and np.nansum(run.column(name)) > 0]
     if stages:

@@ -82,8 +82,8 @@ def _disagreement(run: SeenRun, x: str, x_label: str) -> str:
 
 
 def _agreement(run: SeenRun) -> str:
-    if run.config.by_critics and run.config.validate.rule == "no_early":
-        return ""  # nothing is voted on
+    if not run.config.takes_votes:
+        return ""
     rows = [row for row in run.details if np.isfinite(column([row], "improved_0"))[0]]
     members = [name for name in (rows[0] if rows else ()) if re.fullmatch(r"improved_\d+", name)]
     shares = np.array([column(rows, name) for name in members]).reshape(len(members), len(rows))

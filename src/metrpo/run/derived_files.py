@@ -53,7 +53,8 @@ class DerivedFiles:
         result = result if result is not None and math.isfinite(result) else None
         learned = Learned(state.iteration, state.real_steps, result)
         origin = getattr(state, "origin", None)  # baselines have none
-        for folder in (self._run_dir, self._run_dir / BEST)[: 2 if _is_best(rows) else 1]:
+        folders = [self._run_dir, self._run_dir / BEST] if _is_best(rows) else [self._run_dir]
+        for folder in folders:
             save_policy(folder, state.policy, self._config.task, learned, self._interface, origin, self._config)
 
     def _draw_curve(self, rows: Sequence[Row]) -> None:

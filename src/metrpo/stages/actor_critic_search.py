@@ -116,8 +116,8 @@ def improve_policy(
     learner = jax.device_get(learner)
     happened = jax.tree.map(lambda *xs: np.concatenate(xs), *infos)
     seen = dataset.train.states[-_LOOKED_AT:]
-    old, new = (squashed.mean_policy(x.actor, inputs, seen) for x in (before, learner))
-    old = old if config.validate.rule == "no_early" else state.policy
+    new = squashed.mean_policy(learner.actor, inputs, seen)
+    old = state.policy if config.takes_votes else squashed.mean_policy(before.actor, inputs, seen)
     with clock("validate"):
         values = _values(config, simulator, [old, new], dataset.starts, jax.random.fold_in(key, _JUDGE))
     distance = squashed.kl(squashed.on_host(before.actor), learner.actor, normalised(inputs, seen))
